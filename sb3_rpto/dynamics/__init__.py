@@ -1,0 +1,1 @@
+"""Trainable dynamics: the source world's P_phi."""
