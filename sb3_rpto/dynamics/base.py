@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch as th
@@ -10,7 +11,8 @@ from gymnasium import spaces
 from torch import nn
 
 
-class Transitions(NamedTuple):
+@dataclass(frozen=True)
+class Transitions:
     """A set of ``n`` transitions in the units of the environment, as tensors on one device.
 
     ``terminations`` is 1 where the MDP ended; a time limit or a model horizon is never a termination.
@@ -23,12 +25,12 @@ class Transitions(NamedTuple):
     next_observations: th.Tensor  # (n, observation_dim)
     terminations: th.Tensor  # (n,)
 
-    def __len__(self) -> int:  # type: ignore[override]
+    def __len__(self) -> int:
         return len(self.observations)
 
     def take(self, index: th.Tensor | slice) -> Transitions:
         """The transitions at ``index``."""
-        return Transitions(*(field[index] for field in self))
+        return Transitions(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 class Prediction(NamedTuple):
