@@ -143,7 +143,7 @@ class PhysicalDynamics(Dynamics):
         self.coordinates = nn.Parameter(th.zeros(len(self.declared), dtype=th.float64))
 
     def values(self, coordinates: th.Tensor) -> th.Tensor:
-        """The declared constants in their units, (p,), at ``coordinates`` (p,); differentiable."""
+        """The declared constants in their units, (..., p), at ``coordinates`` (..., p); differentiable."""
         return th.where(self._is_log, self._nominal * coordinates.exp(), self._nominal + self._width * coordinates)
 
     def simulate(self, observations: th.Tensor, actions: th.Tensor, coordinates: th.Tensor) -> th.Tensor:
@@ -151,10 +151,26 @@ class PhysicalDynamics(Dynamics):
 
         :param observations: (n, 4)
         :param actions: (n, 1)
-        :param coordinates: (p,), see the class
+        :param coordinates: (p,), or (n, p) for a world of its own for each transition; see the class
         """
-        current = dict(zip(self.declared, self.values(coordinates).unbind()))
+        current = dict(zip(self.declared, self.values(coordinates).unbind(dim=-1)))
         return cartpole_step(observations.double(), actions.double(), {**self.nominal, **current})
+
+    @th.enable_grad()
+    def linearise(
+        self, observations: th.Tensor, actions: th.Tensor, coordinates: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Next observations (n, 4) and their exact derivative by the coordinates, (n, 4, p), at ``coordinates`` (p,).
+
+        Reverse mode over one copy of phi for each transition: several times faster than ``torch.func.jacfwd`` here.
+        """
+        copies = coordinates.detach().repeat(len(observations), 1).requires_grad_()
+        reached = self.simulate(observations, actions, copies)
+        rows = [
+            th.autograd.grad(column.sum(), copies, retain_graph=True, allow_unused=True, materialize_grads=True)[0]
+            for column in reached.unbind(dim=1)
+        ]
+        return reached.detach(), th.stack(rows, dim=1)
 
     @property
     def constants(self) -> dict[str, float]:
@@ -205,14 +221,11 @@ class PhysicalDynamics(Dynamics):
         moving = (scale > 1e-8).nonzero()[:, 0]
         root = (weight / max(len(moving), 1)).sqrt()[:, None]
 
-        def residual(coordinates: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-            missed = self.simulate(data.observations, data.actions, coordinates) - data.next_observations.double()
-            scaled = root * missed[:, moving] / scale[moving]
-            return scaled, scaled
-
         def linearise(coordinates: th.Tensor) -> _Linearisation:
-            jacobian, value = th.func.jacfwd(residual, has_aux=True)(coordinates)
-            return _Linearisation(value, jacobian)
+            reached, jacobian = self.linearise(data.observations, data.actions, coordinates)
+            missed = reached - data.next_observations.double()
+            unit = root / scale[moving]
+            return _Linearisation(unit * missed[:, moving], unit[:, :, None] * jacobian[:, moving])
 
         phi = self.coordinates.detach().double()
         here = linearise(phi)

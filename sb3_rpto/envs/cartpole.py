@@ -84,10 +84,10 @@ def cartpole_step(state: th.Tensor, action: th.Tensor, parameters: Mapping[str, 
     :param state: (n, 4): position (m), velocity (m/s), angle (rad), angular velocity (rad/s)
     :param action: (n, 1), clipped to [-1, 1]
     :param parameters: the fields of :class:`CartPoleParameters` as numbers or scalar tensors (thresholds are not used)
-    :return: (n, 4), the next state
+    :return: (n, 4), the next state, in the type of ``state``
     """
     x, x_dot, theta, theta_dot = state.unbind(dim=1)
-    clipped = action[:, 0].clamp(-1.0, 1.0)
+    clipped = action[:, 0].to(state.dtype).clamp(-1.0, 1.0)
     return th.stack(_euler((x, x_dot, theta, theta_dot), theta.sin(), theta.cos(), clipped, parameters), dim=1)
 
 
