@@ -77,7 +77,9 @@ class Dynamics(nn.Module, ABC):
         """
 
     @abstractmethod
-    def fit(self, data: Transitions, weights: th.Tensor | None = None, max_steps: int | None = None) -> dict[str, float]:
+    def fit(
+        self, data: Transitions, weights: th.Tensor | None = None, max_steps: int | None = None
+    ) -> dict[str, float]:
         """Move phi towards ``data`` by at most ``max_steps`` gradient steps.
 
         :param data: transitions, oldest first, holding all that is known (a later call passes the same ones and more)

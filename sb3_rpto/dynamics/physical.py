@@ -82,8 +82,8 @@ class PhysicalDynamics(Dynamics):
     (sigma: each dimension's standard one-step change in the data, d: dimensions that change at all) by
     Levenberg-Marquardt steps: Gauss-Newton's direction, its length limited to ``max_step`` so that the source moves
     smoothly towards the target (the curriculum of RTO), and to the point as soon as that is within reach. A step that
-    would raise the error is rejected. Directions that the data do not determine have no component in such a step, so
-    phi stays at its nominal value along them. There is no optimizer and no randomness.
+    would raise the error is shortened until it does not. Directions that the data do not determine have no component
+    in such a step, so phi stays at its nominal value along them. There is no optimizer and no randomness.
 
     :param observation_space: Box (4,)
     :param action_space: Box (1,)
@@ -229,16 +229,16 @@ class PhysicalDynamics(Dynamics):
 
         phi = self.coordinates.detach().double()
         here = linearise(phi)
+        limit = MAX_STEPS if max_steps is None else max_steps
         damping, steps = SINGULAR, 0
-        for _ in range(MAX_STEPS if max_steps is None else max_steps):
+        while steps < limit:
             candidate = self._propose(phi, here, damping)
             if (candidate - phi).abs().max() < 1e-10:
                 break
             there = linearise(candidate)
-            steps += 1
             if there.loss <= here.loss:
-                phi, here, damping = candidate, there, max(damping / 10, SINGULAR)
-            else:
+                phi, here, steps, damping = candidate, there, steps + 1, max(damping / 10, SINGULAR)
+            else:  # shorter until it improves; where nothing does, it soon is too short to go on
                 damping = max(10 * damping, 1e-3)
         with th.no_grad():
             self.coordinates.copy_(phi)

@@ -9,6 +9,8 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
+from hypothesis import given
+from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_rpto.dynamics.base import Transitions
@@ -131,6 +133,27 @@ def test_weights_decide_between_two_worlds():
     )  # scale of weights: no matter
 
 
+def test_a_weight_of_two_is_a_transition_seen_twice():
+    data = collect(60, pole_length=1.5, cart_friction=1.0)
+    weights = th.arange(60) % 3
+    repeated = Transitions(*(getattr(data, k).repeat_interleave(weights, 0) for k in vars(data)))
+    weighted, plain = model(), model()
+    log, expected = weighted.fit(data, weights.float(), max_steps=50), plain.fit(repeated, max_steps=50)
+    assert log["pole_length"] == pytest.approx(expected["pole_length"], rel=1e-12)
+    assert log["loss"] == pytest.approx(expected["loss"], rel=1e-12)
+    assert log["loss"] == pytest.approx(plain.error(repeated) ** 2, rel=1e-6)
+    assert log["loss"] > 1e-3
+
+
+def test_loss_never_rises_even_with_steps_too_long():
+    # Towards a shorter pole Gauss-Newton overshoots: the effect of the length grows as 1 / length.
+    dynamics = model(bounds={"pole_length": (1e-3, 1e3)}, max_step=100.0)
+    data = collect(200, pole_length=0.2)
+    losses = [dynamics.error(data) ** 2] + [dynamics.fit(data, max_steps=1)["loss"] for _ in range(20)]
+    assert (np.diff(losses) <= 0).all()
+    assert dynamics.describe()["pole_length"] == pytest.approx(0.2, abs=1e-5)
+
+
 def test_the_newest_transitions_are_fitted():
     old, new = collect(50), collect(100, pole_length=1.1)
     new = Transitions(*(getattr(new, k).repeat_interleave(MAX_TRANSITIONS // 100, 0) for k in vars(new)))
@@ -158,6 +181,17 @@ def test_a_friction_comes_back_to_its_bound():
     log = dynamics.fit(collect())
     assert log["cart_friction"] == pytest.approx(0.0, abs=1e-5)
     assert ContinuousCartPoleEnv(**dynamics.constants).parameters.cart_friction >= 0
+
+
+@given(st.floats(1e-3, 9.9), st.floats(0.1, 9.9), st.booleans())
+def test_values_at_a_bound_are_within_it(friction, length, upper):
+    constants = {"cart_friction": friction, "pole_length": length}
+    dynamics = model(*constants, constants=constants)
+    with th.no_grad():
+        dynamics.coordinates.copy_(dynamics._upper if upper else dynamics._lower)
+    for name, value in dynamics.describe().items():
+        assert dynamics.bounds[name][0] <= value <= dynamics.bounds[name][1]
+        assert value == pytest.approx(dynamics.bounds[name][upper], rel=1e-12, abs=1e-12)
 
 
 def test_what_the_data_cannot_identify_stays_nominal():

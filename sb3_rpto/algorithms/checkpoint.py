@@ -1,0 +1,159 @@
+"""What a checkpoint holds beyond SB3's zip, so that resuming equals not having stopped."""
+
+from __future__ import annotations
+
+import io
+import os
+import pathlib
+import random
+import warnings
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_rpto.algorithms.snapshots import PolicySnapshots
+from sb3_rpto.algorithms.worlds import find_ledger
+from sb3_rpto.envs.state import restore_state, save_state
+
+if TYPE_CHECKING:
+    from sb3_rpto.algorithms.transfer import TransferAlgorithm
+
+Self = TypeVar("Self", bound="Resumable")
+
+
+class Resumable(PolicySnapshots):
+    """A complete checkpoint: SB3's zip with the dynamics, and where both worlds and the random streams stand."""
+
+    _resume_state: dict[str, Any] | None
+    _warm: bool
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Save all that a resumed run needs, except the replay buffers (``save_replay_buffer``); atomic for paths."""
+        self._resume_state = self._resume_state or capture(self)
+        try:
+            write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
+        finally:
+            self._resume_state = None
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """Save both replay buffers as one pickle; atomic for paths."""
+        write_atomically(path, super().save_replay_buffer, suffix="pkl")
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[Self],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        *args: Any,
+        target_env: GymEnv | str | None = None,
+        **kwargs: Any,
+    ) -> Self:
+        """Load a checkpoint; without environments the model can predict, with them it resumes.
+
+        :param path: of the zip
+        :param env: the source
+        :param args: as SB3's ``load``
+        :param target_env: the target
+        :param kwargs: as SB3's ``load``
+        """
+        model = super().load(path, env, *args, **kwargs)
+        model._warm = model._resume_state["warm"]
+        if target_env is not None:
+            model.set_target_env(target_env)
+        return model
+
+    def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto") -> None:
+        """As in SB3; a model that was given parameters counts as warm-started and is not trained in the source."""
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        self._warm = True
+
+    def _excluded_save_params(self) -> list[str]:
+        own = ["target_env", "dynamics", "_source_world", "_null_check", "_passed", "_last_obs", "_last_original_obs"]
+        return [*super()._excluded_save_params(), *own]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = super()._get_torch_save_params()
+        if self.dynamics is not None:
+            state_dicts.append("dynamics")
+            if hasattr(self.dynamics, "optimizer"):
+                state_dicts.append("dynamics.optimizer")
+        return state_dicts, variables
+
+
+def capture(model: TransferAlgorithm) -> dict[str, Any]:
+    """Where the two worlds and the random streams stand, as plain data."""
+    return {
+        "random": random.getstate(),
+        "numpy": np.random.get_state(),
+        "torch": th.get_rng_state(),
+        "source": None if model.env is None else save_state(model.env),
+        "target": None if model.target_env is None else save_state(find_ledger(model.target_env).venv),
+        "source_world": None if model._source_world is None else model._source_world.get_state(),
+        "last_obs": model._last_obs,
+        "last_original_obs": model._last_original_obs,
+        "null_check_done": model._null_check is None,
+        "warm": model._warm,
+    }
+
+
+def resume(model: TransferAlgorithm) -> None:
+    """Put the worlds and the random streams back to where the loaded checkpoint left them.
+
+    A world that cannot be put back begins a new episode, and a warning says which.
+    """
+    state, model._resume_state = model._resume_state, None
+    if state is None:
+        return
+    restarted = []
+    if state["source"] is None:
+        restarted.append("source")
+    else:
+        restore_state(model.env, state["source"])
+        if state["source_world"] is not None and model._source_world is not None:
+            model._source_world.set_state(state["source_world"])
+    if not model._offline:
+        if state["target"] is None or state["last_obs"] is None:
+            restarted.append("target")
+        else:
+            restore_state(find_ledger(model.target_env).venv, state["target"])
+            model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
+            if state["null_check_done"]:
+                model._null_check = None
+    if restarted:
+        warnings.warn(
+            f"the {' and the '.join(restarted)} environment cannot restore its state: it begins a new episode, "
+            "so the resumed run differs from one that never stopped",
+            stacklevel=3,
+        )
+    random.setstate(state["random"])
+    np.random.set_state(state["numpy"])
+    th.set_rng_state(state["torch"])
+
+
+def write_atomically(path: Any, write: Callable[[Any], None], suffix: str = "zip") -> None:
+    """Write through a temporary file beside ``path``: a killed run leaves the old file or the new one, never half.
+
+    :param path: where the file goes; ``suffix`` is added when it has none; file objects are written directly
+    :param write: writes to the path that it is given
+    """
+    if not isinstance(path, str | pathlib.Path):
+        write(path)
+        return
+    path = pathlib.Path(path)
+    if path.suffix == "":
+        path = path.with_name(f"{path.name}.{suffix}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{suffix}")
+    try:
+        write(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

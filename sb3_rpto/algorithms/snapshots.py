@@ -1,0 +1,47 @@
+"""Never worse than you came: policies to go back to."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+
+from sb3_rpto.algorithms.update import RelativeUpdate
+
+
+class PolicySnapshots(RelativeUpdate):
+    """Keeps the policy that came from the source and the best one seen in the target."""
+
+    #: by name: "source" (as it came) and "best" (highest return in the target)
+    snapshots: dict[str, dict[str, Any]]
+    best_mean_reward: float
+
+    def keep_if_best(self, mean_reward: float) -> bool:
+        """Keep the current policy as "best" if it earned more than any before.
+
+        :param mean_reward: its return in the target, however it was measured
+        :return: whether it was kept
+        """
+        if mean_reward <= self.best_mean_reward:
+            return False
+        self.best_mean_reward = mean_reward
+        self.take_snapshot("best")
+        return True
+
+    def rollback(self, to: Literal["best", "source"] = "best") -> None:
+        """Go back to the best policy seen in the target, or to the one that came from the source.
+
+        :param to: "best" or "source"; restores actor, critics and temperature
+        :raises ValueError: when there is no such policy yet
+        """
+        if to not in self.snapshots:
+            raise ValueError(f"no policy {to!r} to roll back to; there is {sorted(self.snapshots) or 'none yet'}")
+        snapshot = self.snapshots[to]
+        self.policy.load_state_dict(snapshot["policy"])
+        if self.log_ent_coef is not None:
+            self.log_ent_coef.data.fill_(float(np.log(snapshot["temperature"])))
+
+    def take_snapshot(self, name: str) -> None:
+        """Keep actor, critics and temperature under ``name``, on the CPU."""
+        state = {key: value.detach().cpu().clone() for key, value in self.policy.state_dict().items()}
+        self.snapshots[name] = {"policy": state, "temperature": float(self.temperature())}

@@ -1,0 +1,155 @@
+"""Step 3 of Algorithm 1: interact with the source world and fill D_source."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_rpto.algorithms.worlds import check_finite
+from sb3_rpto.dynamics.base import Dynamics
+from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
+from sb3_rpto.envs.state import restore_state, save_state
+
+if TYPE_CHECKING:
+    from sb3_rpto.algorithms.transfer import TransferAlgorithm
+
+RolloutStart = Literal["target", "source", "mix"]
+
+
+class EpisodeSource:
+    """Whole episodes of a source VecEnv: the real simulator (RPO) or one that the dynamics answer.
+
+    :param env: stepped by the current stochastic policy
+    """
+
+    def __init__(self, env: VecEnv) -> None:
+        self.env = env
+        self.returns: deque[float] = deque(maxlen=100)
+        self.lengths: deque[int] = deque(maxlen=100)
+        self._last_obs: np.ndarray | None = None
+
+    def interact(self, model: TransferAlgorithm, n_steps: int, random: bool = False) -> int:
+        """Step at least ``n_steps`` times in all environments together and store every transition.
+
+        :param model: whose policy acts and whose D_source is filled
+        :param n_steps: number of transitions
+        :param random: uniform actions instead of the policy's
+        :return: the number of transitions stored
+        """
+        normaliser = unwrap_vec_normalize(self.env)
+        if self._last_obs is None:
+            self._last_obs = self.env.reset()  # type: ignore[assignment]
+        model.policy.set_training_mode(False)
+        steps = 0
+        while steps < n_steps:
+            raw_obs = normaliser.get_original_obs() if normaliser is not None else self._last_obs
+            if random:
+                actions = np.array([self.env.action_space.sample() for _ in range(self.env.num_envs)])
+            else:
+                actions, _ = model.policy.predict(self._last_obs, deterministic=False)
+            new_obs, rewards, dones, infos = self.env.step(actions)
+            raw_next = np.array(normaliser.get_original_obs() if normaliser is not None else new_obs)
+            if normaliser is not None:
+                rewards = normaliser.get_original_reward()
+            for i in np.flatnonzero(dones):
+                terminal = infos[i]["terminal_observation"]
+                raw_next[i] = terminal if normaliser is None else normaliser.unnormalize_obs(terminal)
+            check_finite("source", observation=raw_next, reward=rewards)
+            timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+            scaled = model.policy.scale_action(actions)
+            model.replay_buffer.append("source", raw_obs, raw_next, scaled, rewards, dones, timeouts)
+            for info in infos:
+                if "episode" in info:
+                    self.returns.append(info["episode"]["r"])
+                    self.lengths.append(info["episode"]["l"])
+            self._last_obs = new_obs  # type: ignore[assignment]
+            steps += self.env.num_envs
+        return steps
+
+    def log(self) -> dict[str, float]:
+        """Mean return and length of the last 100 source episodes."""
+        if not self.returns:
+            return {}
+        return {"ep_rew_mean": float(np.mean(self.returns)), "ep_len_mean": float(np.mean(self.lengths))}
+
+    def get_state(self) -> dict[str, Any] | None:
+        """Where the episodes stand, or None when the environments cannot say."""
+        inner = self.env.unwrapped
+        state = {"model": inner.get_state()} if isinstance(inner, DynamicsVecEnv) else {"env": save_state(self.env)}
+        if None in state.values():
+            return None
+        normaliser = unwrap_vec_normalize(self.env)
+        originals = {} if normaliser is None else {"old_obs": normaliser.old_obs, "old_reward": normaliser.old_reward}
+        return {**state, **originals, "last_obs": self._last_obs, "returns": self.returns, "lengths": self.lengths}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Continue where :meth:`get_state` was called."""
+        if "model" in state:
+            self.env.reset()
+            self.env.unwrapped.set_state(state["model"])  # type: ignore[attr-defined]
+        else:
+            self.env.reset()
+            restore_state(self.env, state["env"])
+        normaliser = unwrap_vec_normalize(self.env)
+        if normaliser is not None:
+            normaliser.old_obs, normaliser.old_reward = state["old_obs"], state["old_reward"]
+        self._last_obs, self.returns, self.lengths = state["last_obs"], state["returns"], state["lengths"]
+
+
+class BranchSource:
+    """One-step branches of the learned dynamics (horizon 1) from states of the target, the source, or both.
+
+    :param dynamics: answers the step
+    :param rollout_start: "target" (states of D_target), "source" (states of the real source), "mix" (half of each)
+    """
+
+    def __init__(self, dynamics: Dynamics, rollout_start: RolloutStart) -> None:
+        self.dynamics = dynamics
+        self.rollout_start = rollout_start
+
+    def interact(self, model: TransferAlgorithm, n_steps: int) -> int:
+        """Branch ``n_steps`` times and store every transition; arguments as :meth:`EpisodeSource.interact`."""
+        starts = self._starts(model, n_steps)
+        normaliser = model.get_vec_normalize_env()
+        seen = starts if normaliser is None else normaliser.normalize_obs(starts)
+        model.policy.set_training_mode(False)
+        with th.no_grad():
+            scaled = model.actor(th.as_tensor(seen, device=model.device).float(), deterministic=False)
+        low, high = (th.as_tensor(b, device=model.device) for b in (model.action_space.low, model.action_space.high))
+        actions = low + 0.5 * (scaled + 1.0) * (high - low)
+        answer = self.dynamics.step(th.as_tensor(starts, device=model.device), actions, deterministic=False)
+        next_obs, rewards = answer.next_observations.cpu().numpy(), answer.rewards.cpu().numpy()
+        check_finite("modelled source", observation=next_obs, reward=rewards)
+        terminations = answer.terminations.cpu().numpy()
+        model.replay_buffer.append("source", starts, next_obs, scaled.cpu().numpy(), rewards, terminations)
+        return n_steps
+
+    def _starts(self, model: TransferAlgorithm, n: int) -> np.ndarray:
+        """Observations to branch from, (n, observation_dim), raw."""
+        buffer = model.replay_buffer
+        n_target = {"target": n, "source": 0, "mix": n // 2}[self.rollout_start]
+        if buffer.target.size() == 0:
+            n_target = 0  # before the first target transition only the source has states
+        pools = []
+        if n_target > 0:
+            rows = np.random.randint(buffer.target.size(), size=n_target)
+            pools.append(buffer.target.observations[rows, 0])
+        if n > n_target:
+            rows = np.random.randint(len(buffer.source_starts), size=n - n_target)
+            pools.append(buffer.source_starts[rows])
+        return np.concatenate(pools)
+
+    def log(self) -> dict[str, float]:
+        """Nothing: branches have no episodes."""
+        return {}
+
+    def get_state(self) -> dict[str, Any]:
+        """Nothing to keep: branches have no episodes."""
+        return {}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Nothing to restore."""

@@ -1,0 +1,210 @@
+"""Steps 5 and 6 of Algorithm 1: the critic on D_source, the actor by RPO, the dynamics by RTO."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.sac.policies import SACPolicy
+from torch.nn import functional as F
+
+from sb3_rpto.buffers import DualReplayBuffer, World, chronological
+from sb3_rpto.dynamics.base import Dynamics, Transitions
+from sb3_rpto.dynamics.weights import WeightingName, effective_sample_size, rto_weights
+
+#: The actor's batches alternate: four from D_target, then one from D_source (f = 5 in the paper's appendix).
+ALTERNATION = 5
+
+
+class RelativeUpdate(SAC):
+    """SAC with a batch of its own for the actor, and with trainable dynamics; see :class:`TransferAlgorithm`."""
+
+    #: whether step 6 of Algorithm 1 applies RPO, and whether it applies RTO
+    updates_policy: ClassVar[bool]
+    updates_dynamics: ClassVar[bool]
+
+    replay_buffer: DualReplayBuffer  # type: ignore[assignment]
+    dynamics: Dynamics | None
+    weighting: WeightingName | None
+    weight_floor: float
+    real_ratio: float
+    model_train_freq: int
+    #: plain SAC in the source is under way
+    _pretraining: bool
+    #: target steps since the last update, since the last fit, and actor updates so far
+    _collected: int
+    _since_fit: int
+    _actor_updates: int
+    _offline: bool
+
+    def _policy_learns(self) -> bool:
+        return self.updates_policy or self._pretraining
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        """Step 5, the critic on D_source, and step 6, the actor by RPO; given the same batch it is SAC's update.
+
+        :param gradient_steps: number of updates
+        :param batch_size: transitions in a batch
+        """
+        self.policy.set_training_mode(True)
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers.append(self.ent_coef_optimizer)
+        self._update_learning_rate(optimizers)
+        losses: dict[str, list[float]] = {}
+        for gradient_step in range(gradient_steps):
+            critic_batch, actor_batch = self.sample_batches(batch_size)
+            step_losses: dict[str, th.Tensor] = {}
+            ent_coef = self.temperature()
+            # The order is SAC's: the actor samples first, its loss then uses the updated critic.
+            if self._policy_learns():
+                if self.use_sde:
+                    self.actor.reset_noise()
+                actions_pi, log_prob = self.actor.action_log_prob(actor_batch.observations)
+                log_prob = log_prob.reshape(-1, 1)
+                if self.ent_coef_optimizer is not None:
+                    step_losses["ent_coef_loss"] = self.temperature_loss(log_prob)
+                    _descend(self.ent_coef_optimizer, step_losses["ent_coef_loss"])
+            step_losses["critic_loss"] = self.critic_loss(critic_batch, ent_coef)
+            _descend(self.critic.optimizer, step_losses["critic_loss"])
+            if self._policy_learns():
+                step_losses["actor_loss"] = self.actor_loss(actor_batch, actions_pi, log_prob, ent_coef)
+                _descend(self.actor.optimizer, step_losses["actor_loss"])
+            if gradient_step % self.target_update_interval == 0:
+                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+            for name, loss in step_losses.items():
+                losses.setdefault(name, []).append(loss.item())
+        self._n_updates += gradient_steps
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/ent_coef", self.temperature().item())
+        for name, values in losses.items():
+            self.logger.record(f"train/{name}", float(np.mean(values)))
+
+    def fit_dynamics(self) -> None:
+        """Step 6, RTO: every ``model_train_freq`` target steps move phi towards D_target by the weighted loss."""
+        self._since_fit += self._collected
+        if not self.updates_dynamics or self._since_fit < self.model_train_freq or self.replay_buffer.size() < 2:
+            return
+        self._since_fit = 0
+        assert self.dynamics is not None
+        data = self.transitions("target")
+        self.logger.record("dynamics/error_before", self.dynamics.error(data))
+        weights = None
+        if self.weighting is not None:
+            weights = rto_weights(
+                self.weighting,
+                self._with_critic_rewards(data),
+                self.dynamics,
+                self.soft_value,
+                self.q_value,
+                self.gamma,
+                self.weight_floor,
+            )
+            self.logger.record("rto/effective_samples", effective_sample_size(weights))
+        for name, value in {**self.dynamics.fit(data, weights), **self.dynamics.describe()}.items():
+            self.logger.record(f"dynamics/{name}", value)
+        self.logger.record("dynamics/error", self.dynamics.error(data))
+        if self._offline:
+            self.dump_logs()
+
+    def sample_batches(self, batch_size: int) -> tuple[ReplayBufferSamples, ReplayBufferSamples]:
+        """A batch for the critic, mostly of D_source, and one for the actor, alternating between the worlds.
+
+        The actor sees four batches of D_target, then one of D_source; D_source alone as long as D_target could not
+        fill a batch.
+        """
+        buffer, normaliser = self.replay_buffer, self._vec_normalize_env
+        if self._pretraining:  # plain SAC: one batch of the only world there is
+            batch = buffer.sample(batch_size, env=normaliser, world="source")
+            return batch, batch
+        n_target = round(self.real_ratio * batch_size) if buffer.target.size() > 0 else 0
+        critic_batch = buffer.sample(batch_size - n_target, env=normaliser, world="source")
+        if n_target > 0:
+            critic_batch = _concatenate(critic_batch, buffer.sample(n_target, env=normaliser))
+        from_source = self._actor_updates % ALTERNATION == ALTERNATION - 1 or buffer.target.size() < batch_size
+        self._actor_updates += 1
+        return critic_batch, buffer.sample(batch_size, env=normaliser, world="source" if from_source else "target")
+
+    def critic_loss(self, batch: ReplayBufferSamples, ent_coef: th.Tensor) -> th.Tensor:
+        """Soft Bellman residual, Eq. soft_q: half the sum over critics of the mean squared error."""
+        with th.no_grad():
+            next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
+            next_q = th.cat(self.critic_target(batch.next_observations, next_actions), dim=1).min(dim=1, keepdim=True)[
+                0
+            ]
+            next_value = next_q - ent_coef * next_log_prob.reshape(-1, 1)
+            target = batch.rewards + (1 - batch.dones) * self.gamma * next_value
+        return 0.5 * th.stack([F.mse_loss(q, target) for q in self.critic(batch.observations, batch.actions)]).sum()
+
+    def actor_loss(
+        self, batch: ReplayBufferSamples, actions_pi: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor
+    ) -> th.Tensor:
+        """RPO, Eq. sac: states of the target, values of the source; alpha log pi - min_i Q_i(s, a)."""
+        q_pi = th.cat(self.critic(batch.observations, actions_pi), dim=1).min(dim=1, keepdim=True)[0]
+        return (ent_coef * log_prob - q_pi).mean()
+
+    def temperature(self) -> th.Tensor:
+        """The current entropy coefficient alpha, without gradient."""
+        return self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
+
+    def temperature_loss(self, log_prob: th.Tensor) -> th.Tensor:
+        """SAC's loss of log alpha on the batch that the actor sees."""
+        return -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+
+    def soft_value(self, observations: th.Tensor) -> th.Tensor:
+        """V(s) = min_i Q_target,i(s, a) - alpha log pi(a|s) with a ~ pi(s), raw observations (n, d) -> (n,)."""
+        with th.no_grad():
+            seen = self._normalised(observations)
+            actions, log_prob = self.actor.action_log_prob(seen)
+            q = th.cat(self.critic_target(seen, actions), dim=1).min(dim=1)[0]
+            return q - self.temperature() * log_prob
+
+    def q_value(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """min_i Q_target,i(s, a) of raw observations (n, d) and actions in the environment's units -> (n,)."""
+        low, high = (
+            th.as_tensor(bound, device=self.device) for bound in (self.action_space.low, self.action_space.high)
+        )
+        with th.no_grad():
+            scaled = 2.0 * (actions - low) / (high - low) - 1.0
+            return th.cat(self.critic_target(self._normalised(observations), scaled.float()), dim=1).min(dim=1)[0]
+
+    def transitions(self, world: World) -> Transitions:
+        """All transitions of one world, oldest first, actions in the environment's units, on the model's device."""
+        return as_transitions(chronological(self.replay_buffer.side(world)), self.policy, self.device)
+
+    def _with_critic_rewards(self, data: Transitions) -> Transitions:
+        """``data`` with rewards on the critic's scale (VecNormalize may have changed it)."""
+        if self._vec_normalize_env is None:
+            return data
+        rewards = self._vec_normalize_env.normalize_reward(data.rewards.cpu().numpy())
+        return replace(data, rewards=th.as_tensor(rewards, device=self.device).float())
+
+    def _normalised(self, observations: th.Tensor) -> th.Tensor:
+        if self._vec_normalize_env is None:
+            return observations.float()
+        normalised = self._vec_normalize_env.normalize_obs(observations.cpu().numpy())
+        return th.as_tensor(normalised, device=self.device).float()
+
+
+def as_transitions(arrays: dict[str, np.ndarray], policy: SACPolicy, device: th.device) -> Transitions:
+    """Arrays of :func:`chronological` as tensors, with actions in the environment's units."""
+    tensors = {name: th.as_tensor(array, device=device) for name, array in arrays.items()}
+    tensors["actions"] = th.as_tensor(policy.unscale_action(arrays["actions"]), device=device)
+    return Transitions(**tensors)
+
+
+def _descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+
+
+def _concatenate(a: ReplayBufferSamples, b: ReplayBufferSamples) -> ReplayBufferSamples:
+    rows = (th.cat(pair) for pair in zip(a[:5], b[:5]))
+    return ReplayBufferSamples(*rows)

@@ -1,0 +1,215 @@
+"""The two worlds' environments: what they must satisfy, how target steps are counted, shared normalisation."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
+
+from sb3_rpto.envs.state import accepts_seed, copy_env, restore_state, save_state
+
+
+class TargetLedger(VecEnvWrapper):
+    """Counts every step of the target by purpose and refuses to go over the budget.
+
+    Steps taken inside :meth:`spending` count for the purpose named there, all others (a script that steps the
+    target behind the algorithm's back) as ``"other"``.
+
+    :param venv: the target
+    :param spent: steps by purpose from an earlier run, continued here
+    """
+
+    def __init__(self, venv: VecEnv, spent: dict[str, int] | None = None) -> None:
+        super().__init__(venv)
+        self.spent: Counter[str] = Counter(spent or {})
+        self._purpose = "other"
+        self._allowance: int | None = None
+
+    @contextmanager
+    def spending(self, purpose: str, allowance: int) -> Iterator[None]:
+        """Count the steps inside for ``purpose``, at most ``allowance`` of them.
+
+        :raises RuntimeError: on the step that would exceed the allowance, before it is taken
+        """
+        self._purpose, self._allowance = purpose, allowance
+        try:
+            yield
+        finally:
+            self._purpose, self._allowance = "other", None
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Count, then step."""
+        if self._allowance is not None:
+            if self._allowance < self.num_envs:
+                raise RuntimeError(f"the target-step budget is spent: {dict(self.spent)}")
+            self._allowance -= self.num_envs
+        self.spent[self._purpose] += self.num_envs
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> Any:
+        """The target's answer, unchanged."""
+        return self.venv.step_wait()
+
+    def reset(self) -> Any:
+        """Reset the target; a reset is not counted as a step."""
+        return self.venv.reset()
+
+
+def find_ledger(venv: VecEnv) -> TargetLedger:
+    """The ledger inside a target that :func:`share_normalisation` may have wrapped."""
+    while not isinstance(venv, TargetLedger):
+        venv = venv.venv  # type: ignore[attr-defined]
+    return venv
+
+
+def share_normalisation(venv: VecEnv, source: VecEnv | None) -> VecEnv:
+    """Wrap ``venv`` so that it is normalised by the source's running statistics, which it never updates."""
+    statistics = unwrap_vec_normalize(source) if source is not None else None
+    if statistics is None:
+        return venv
+    shared = VecNormalize(
+        venv,
+        training=False,
+        norm_obs=statistics.norm_obs,
+        norm_reward=statistics.norm_reward,
+        clip_obs=statistics.clip_obs,
+        clip_reward=statistics.clip_reward,
+        gamma=statistics.gamma,
+        epsilon=statistics.epsilon,
+    )
+    if statistics.norm_obs:
+        shared.obs_rms = statistics.obs_rms
+    shared.ret_rms = statistics.ret_rms
+    return shared
+
+
+def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
+    """Refuse what the algorithms are not written for.
+
+    :raises NotImplementedError: for observations that are not a flat Box and for actions that are not a Box
+    """
+    if not isinstance(observation_space, spaces.Box) or is_image_space(observation_space):
+        raise NotImplementedError(
+            f"env has the observation space {observation_space}; only flat Box observations are supported "
+            "(wrap a Dict in gymnasium.wrappers.FlattenObservation)"
+        )
+    if len(observation_space.shape) != 1:
+        raise NotImplementedError(
+            f"env has observations of shape {observation_space.shape}; flatten them with "
+            "gymnasium.wrappers.FlattenObservation"
+        )
+    if not isinstance(action_space, spaces.Box):
+        raise NotImplementedError(
+            f"env has the action space {action_space}; only continuous (Box) actions are supported"
+        )
+
+
+def check_pair(source: VecEnv, target: VecEnv) -> None:
+    """Refuse a target that cannot be the source's target.
+
+    :raises ValueError: for the same environment object, unequal spaces, or a target with statistics of its own
+    """
+    if _members(source) & _members(target):
+        raise ValueError("target_env is env: both worlds would step the same object; build a second environment")
+    for name in ("observation_space", "action_space"):
+        of_source, of_target = getattr(source, name), getattr(target, name)
+        if of_source != of_target:
+            raise ValueError(
+                f"target_env has {name} {of_target}, env has {of_source}; source and target must share their spaces"
+            )
+    if unwrap_vec_normalize(target) is not None:
+        raise ValueError(
+            "target_env is wrapped in VecNormalize; wrap env (the source) alone, the target then shares its statistics"
+        )
+
+
+def check_seedable(env: gym.Env | VecEnv, name: str) -> None:
+    """Refuse an environment that cannot be reset with a seed.
+
+    :raises ValueError: naming the argument
+    """
+    if isinstance(env, gym.Env) and not accepts_seed(env):
+        raise ValueError(
+            f"{name}: reset() of {env} takes no seed=; give it the signature reset(self, *, seed=None, options=None)"
+        )
+
+
+def check_finite(world: str, **arrays: np.ndarray) -> None:
+    """Refuse NaN and infinity before they reach a buffer.
+
+    :raises ValueError: naming the world and the offending values
+    """
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(
+                f"the {world} environment returned a {name} that is not finite: {array}; "
+                "mend the environment (stable_baselines3.common.vec_env.VecCheckNan finds the step)"
+            )
+
+
+def _members(venv: VecEnv) -> set[int]:
+    inner = venv.unwrapped
+    envs = getattr(inner, "envs", None)
+    return {id(inner)} if envs is None else {id(env.unwrapped) for env in envs}
+
+
+class NullShiftCheck:
+    """Watches the first target transitions and tells whether the source would have stepped exactly so.
+
+    The source is stepped in a copy that starts in the target's own state, so no target step is spent. Where the
+    state cannot be carried over (processes, environments that cannot save their state) nothing is claimed.
+
+    :param source: the source; untouched
+    :param target: the target, just reset
+    :param n_steps: how many transitions to compare
+    """
+
+    def __init__(self, source: VecEnv, target: VecEnv, n_steps: int = 20) -> None:
+        self._left = n_steps
+        self._copy: DummyVecEnv | None = None
+        start, twin = _single_state(target), copy_env(source)
+        if start is None or twin is None:
+            return
+        copy = DummyVecEnv([lambda: twin])
+        copy.reset()
+        try:
+            restore_state(copy, start)
+        except Exception:  # a state of another layout: the worlds differ already
+            return
+        self._copy = copy
+
+    def agrees(self, actions: np.ndarray, next_observation: np.ndarray, done: bool) -> bool | None:
+        """Step the copy along.
+
+        :param actions: (1, action_dim), what the target's first environment received
+        :param next_observation: (observation_dim,), what it answered
+        :param done: whether its episode ended
+        :return: True once all of ``n_steps`` transitions (or the first episode) agreed, None while it is not known
+        """
+        if self._copy is None:
+            return None
+        answer, _, copy_done, infos = self._copy.step(actions)
+        answer = infos[0].get("terminal_observation", answer[0])
+        if not np.allclose(answer, next_observation, rtol=1e-9, atol=1e-9) or bool(copy_done[0]) != done:
+            self._copy = None
+            return None
+        self._left -= 1
+        if self._left > 0 and not done:
+            return None
+        self._copy = None
+        return True
+
+
+def _single_state(venv: VecEnv) -> dict[str, Any] | None:
+    """State of a one-environment DummyVecEnv around the first environment of ``venv``."""
+    inner = venv.unwrapped
+    if not isinstance(inner, DummyVecEnv):
+        return None
+    return save_state(DummyVecEnv([lambda: inner.envs[0]]))

@@ -1,0 +1,233 @@
+"""Replay memory for two worlds, kept apart."""
+
+from __future__ import annotations
+
+import io
+import pathlib
+from typing import Any, Literal
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
+from stable_baselines3.common.save_util import load_from_pkl
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+World = Literal["source", "target"]
+
+#: Target data are scarce: this many transitions hold any budget for which a transfer method is worth its while.
+TARGET_CAPACITY = 200_000
+
+_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+class DualReplayBuffer(ReplayBuffer):
+    """D_source and D_target of Algorithm 1 in one SB3 replay buffer.
+
+    ``add``, ``size`` and ``sample`` on the object mean the target, so SB3's own collection code, callbacks and
+    ``save_replay_buffer`` work on it; ``sample(n, world="source")`` draws from the other side. Each side is an SB3
+    replay buffer of its own in :attr:`source` and :attr:`target`. Both take any number of environments and of
+    one-step branches at once; rows are kept in the order in which they came.
+
+    :param buffer_size: capacity of the source side in transitions
+    :param observation_space: a Box
+    :param action_space: a Box
+    :param device: device of the sampled tensors
+    :param n_envs: ignored (each side accepts any number of rows at a time); SB3 passes it
+    :param optimize_memory_usage: refused: branches are not trajectories, so their next observations must be stored
+    :param handle_timeout_termination: as in SB3
+    :param target_size: capacity of the target side, by default the smaller of ``buffer_size`` and 200,000
+    :param side_class: the replay buffer class of each side
+    :param side_kwargs: further arguments of each side's constructor
+    :raises NotImplementedError: for ``optimize_memory_usage=True``
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        *,
+        target_size: int | None = None,
+        side_class: type[ReplayBuffer] = ReplayBuffer,
+        side_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        if optimize_memory_usage:
+            raise NotImplementedError(
+                "optimize_memory_usage=True stores trajectories only, the source side also holds one-step branches; "
+                "leave it False and lower buffer_size to save memory"
+            )
+        kwargs = {"handle_timeout_termination": handle_timeout_termination, **(side_kwargs or {})}
+        target_size = min(buffer_size, TARGET_CAPACITY) if target_size is None else target_size
+        self.source = side_class(buffer_size, observation_space, action_space, device=device, **kwargs)
+        self.target = side_class(target_size, observation_space, action_space, device=device, **kwargs)
+        #: observations of the real source environment, from which model branches may start; (n, observation_dim)
+        self.source_starts = np.empty((0, *observation_space.shape), dtype=observation_space.dtype)
+        # BaseBuffer alone: ReplayBuffer's constructor would allocate a third set of arrays.
+        BaseBuffer.__init__(self, target_size, observation_space, action_space, device)
+        self.optimize_memory_usage = False
+        self.handle_timeout_termination = handle_timeout_termination
+
+    def __getattr__(self, name: str) -> Any:
+        # SB3 reads the arrays of ``model.replay_buffer``; there it means the target's.
+        if name in _ARRAYS and "target" in self.__dict__:
+            return getattr(self.target, name)
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    @property
+    def pos(self) -> int:  # type: ignore[override]
+        """Write position of the target side."""
+        return self.target.pos
+
+    @pos.setter
+    def pos(self, value: int) -> None:
+        self.target.pos = value
+
+    @property
+    def full(self) -> bool:  # type: ignore[override]
+        """Whether the target side has wrapped around."""
+        return self.target.full
+
+    @full.setter
+    def full(self, value: bool) -> None:
+        self.target.full = value
+
+    @property
+    def device(self) -> th.device:  # type: ignore[override]
+        """Device of the sampled tensors; setting it moves no memory."""
+        return self.target.device
+
+    @device.setter
+    def device(self, value: th.device) -> None:
+        self.source.device = self.target.device = value
+
+    def side(self, world: World) -> ReplayBuffer:
+        """The replay buffer of one world."""
+        if world not in ("source", "target"):
+            raise ValueError(f'world must be "source" or "target", not {world!r}')
+        return self.source if world == "source" else self.target
+
+    def reset(self) -> None:
+        """Forget both sides."""
+        self.source.reset()
+        self.target.reset()
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Add one target step of any number of environments; arguments as in SB3."""
+        timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+        self.append("target", obs, next_obs, action, reward, done, timeouts)
+
+    def append(
+        self,
+        world: World,
+        observations: np.ndarray,
+        next_observations: np.ndarray,
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        dones: np.ndarray,
+        timeouts: np.ndarray | None = None,
+    ) -> None:
+        """Add ``n`` transitions to one world.
+
+        :param world: "source" or "target"
+        :param observations: (n, observation_dim), raw (not normalised)
+        :param next_observations: (n, observation_dim)
+        :param actions: (n, action_dim), scaled to [-1, 1] as SB3 stores them
+        :param rewards: (n,)
+        :param dones: (n,), whether the episode ended
+        :param timeouts: (n,), whether it ended by a time limit; None: nowhere
+        """
+        side = self.side(world)
+        n = len(rewards)
+        timeouts = np.zeros(n, dtype=bool) if timeouts is None else timeouts
+        actions = actions.reshape(n, -1)
+        if type(side).add is not ReplayBuffer.add or n > side.buffer_size:  # a class of the user's sees every row
+            for i in range(n):
+                info = [{"TimeLimit.truncated": bool(timeouts[i])}]
+                row = slice(i, i + 1)
+                side.add(observations[row], next_observations[row], actions[row], rewards[row], dones[row], info)
+            return
+        rows = (side.pos + np.arange(n)) % side.buffer_size
+        side.observations[rows, 0] = observations
+        side.next_observations[rows, 0] = next_observations
+        side.actions[rows, 0] = actions
+        side.rewards[rows, 0] = rewards
+        side.dones[rows, 0] = dones
+        if side.handle_timeout_termination:
+            side.timeouts[rows, 0] = timeouts
+        side.full = side.full or side.pos + n >= side.buffer_size
+        side.pos = (side.pos + n) % side.buffer_size
+
+    def sample(  # type: ignore[override]
+        self, batch_size: int, env: VecNormalize | None = None, world: World = "target"
+    ) -> ReplayBufferSamples:
+        """Draw transitions uniformly from one world; as SB3's ``ReplayBuffer.sample`` on that side."""
+        side = self.side(world)
+        if side.size() == 0:
+            raise ValueError(f"the {world} side of the replay buffer is empty: nothing can be sampled from it")
+        return side.sample(batch_size, env=env)
+
+
+def chronological(side: ReplayBuffer) -> dict[str, np.ndarray]:
+    """All transitions of one side, oldest first, as arrays.
+
+    :return: ``observations`` and ``next_observations`` (n, observation_dim), ``actions`` (n, action_dim) scaled to
+        [-1, 1], ``rewards`` (n,), ``terminations`` (n,) without time limits
+    """
+    order = np.arange(side.size())
+    if side.full:
+        order = (order + side.pos) % side.buffer_size
+    flat = {
+        name: getattr(side, name)[order].reshape(len(order) * side.n_envs, *getattr(side, name).shape[2:])
+        for name in _ARRAYS
+    }
+    terminations = flat.pop("dones") * (1 - flat.pop("timeouts"))
+    return {**flat, "terminations": terminations}
+
+
+def load_transitions(data: ReplayBuffer | str | pathlib.Path | io.BufferedIOBase) -> dict[str, np.ndarray]:
+    """Read transitions from an SB3 replay buffer, its pickle, or an ``.npz`` file.
+
+    The ``.npz`` form holds ``obs``, ``act`` (scaled to [-1, 1]), ``next_obs``, ``rew`` and ``done`` (terminal, not a
+    time limit). Of a :class:`DualReplayBuffer` the source side is read.
+
+    :return: the arrays of :func:`chronological`
+    :raises ValueError: for a file with other contents, an empty set or values that are not finite
+    """
+    if isinstance(data, str | pathlib.Path) and str(data).endswith(".npz"):
+        names = {
+            "observations": "obs",
+            "next_observations": "next_obs",
+            "actions": "act",
+            "rewards": "rew",
+            "terminations": "done",
+        }
+        with np.load(data) as file:
+            missing = sorted(set(names.values()) - set(file.files))
+            if missing:
+                raise ValueError(f"{data} lacks the arrays {missing}; expected obs, act, next_obs, rew, done")
+            arrays = {name: file[key] for name, key in names.items()}
+    else:
+        buffer = data if isinstance(data, ReplayBuffer) else load_from_pkl(data)
+        if not isinstance(buffer, ReplayBuffer):
+            raise ValueError(f"expected an SB3 ReplayBuffer, its pickle or an .npz file, got {type(buffer).__name__}")
+        arrays = chronological(buffer.source if isinstance(buffer, DualReplayBuffer) else buffer)
+    if len(arrays["rewards"]) == 0:
+        raise ValueError("the transitions to load are empty")
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} of the loaded transitions hold NaN or infinite values; remove those rows")
+    return arrays

@@ -1,0 +1,303 @@
+"""Snapshots and trial copies of environments, so that a resumed run continues bit for bit.
+
+A snapshot is complete or there is none: every layer must be of a class whose state is known here.
+"""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import pickle
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import wrappers
+from gymnasium.envs.classic_control import Continuous_MountainCarEnv, PendulumEnv
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
+
+# What changes in each layer after it is made. Clocks are left out: they do not influence the course of a run.
+_WRAPPERS: dict[type[gym.Wrapper], tuple[str, ...]] = {
+    wrappers.TimeLimit: ("_elapsed_steps",),
+    wrappers.OrderEnforcing: ("_has_reset",),
+    wrappers.PassiveEnvChecker: (
+        *("checked_reset", "checked_step", "checked_render", "close_called", "checked_data_reuse", "_previous_data"),
+    ),
+    wrappers.Autoreset: ("autoreset",),
+    wrappers.RecordEpisodeStatistics: (
+        *("episode_count", "episode_returns", "episode_lengths", "time_queue", "return_queue", "length_queue"),
+    ),
+    wrappers.ClipAction: (),
+    wrappers.RescaleAction: (),
+    wrappers.FlattenObservation: (),
+    wrappers.DtypeObservation: (),
+    Monitor: (
+        *("rewards", "needs_reset", "episode_returns", "episode_lengths", "episode_times"),
+        *("total_steps", "current_reset_info"),
+    ),
+}
+_VEC_WRAPPERS: dict[type[VecEnvWrapper], tuple[str, ...]] = {
+    VecNormalize: ("obs_rms", "ret_rms", "returns", "old_obs", "old_reward"),
+    VecMonitor: ("episode_returns", "episode_lengths", "episode_count"),
+}
+_ENVS: dict[type[gym.Env], tuple[str, ...]] = {PendulumEnv: ("state", "last_u"), Continuous_MountainCarEnv: ("state",)}
+_VECTORISED = ("buf_obs", "buf_dones", "buf_rews", "buf_infos", "reset_infos", "_seeds", "_options")
+# Beside the simulation, gymnasium's MuJoCo tasks keep these; Pusher writes the drawn object's place into init_qpos.
+_MUJOCO = ("init_qpos", "init_qvel", "goal", "goal_pos", "cylinder_pos")
+_MUJOCO_SIZES = ("signature", "nq", "nv", "nu", "na")
+
+# Windows and files belong to the original; a copy has none.
+_HANDLES = {"mujoco_renderer", "results_writer", "screen", "clock", "surf", "viewer"}
+
+
+class _Unknown(Exception):
+    """A layer whose state is not known here."""
+
+
+def save_state(env: VecEnv) -> dict[str, Any] | None:
+    """Take a snapshot of the simulations, random streams, wrappers and buffers of ``env``.
+
+    Known are DummyVecEnv within VecNormalize and VecMonitor, the wrappers that gymnasium.make and SB3 put around
+    environments, gymnasium's MuJoCo tasks, Pendulum, MountainCarContinuous and every environment that offers
+    ``get_state()`` and ``set_state(state)``. Clocks and open files are left out.
+
+    :param env: the environment, untouched
+    :return: plain data that pickles, or None when any layer is unknown
+    """
+    try:
+        layers = []
+        while isinstance(env, VecEnvWrapper):
+            layers.append(_attributes(env, _VEC_WRAPPERS.get(type(env))))
+            env = env.venv
+        if type(env) is not DummyVecEnv:
+            return None
+        return {
+            "vec_wrappers": layers,
+            "buffers": _attributes(env, _VECTORISED),
+            "envs": [_save_env(member) for member in env.envs],
+        }
+    except _Unknown:
+        return None
+
+
+def restore_state(env: VecEnv, state: dict[str, Any]) -> None:
+    """Continue where :func:`save_state` was called; the state may be restored any number of times.
+
+    :param env: an environment built as the saved one was; afterwards ``env.step`` continues without a reset
+    :param state: what :func:`save_state` returned
+    :raises ValueError: when ``env`` is not built like the saved one; nothing is changed then
+    """
+    vec_layers: list[VecEnv] = []
+    while isinstance(env, VecEnvWrapper):
+        vec_layers.append(env)
+        env = env.venv
+    members = env.envs if type(env) is DummyVecEnv else []
+    plan = list(zip(vec_layers, state["vec_wrappers"], strict=False))
+    _require(len(vec_layers), len(state["vec_wrappers"]), "VecEnv wrappers")
+    _require(len(members), len(state["envs"]), "environments in a DummyVecEnv")
+    for member, saved in zip(members, state["envs"]):
+        layers = _layers(member)
+        _require([_name(layer) for layer in layers], [layer["class"] for layer in saved["layers"]], "layers")
+        plan += zip(layers, saved["layers"])
+        _require(_kind(layers[-1]), saved["kind"], "kind of simulation")
+    for layer, saved in plan:
+        _require(_name(layer), saved["class"], "layer")
+    for layer, saved in [*plan, (env, state["buffers"])]:
+        vars(layer).update(copy.deepcopy(saved["values"]))
+    for member, saved in zip(members, state["envs"]):
+        _restore_simulation(member.unwrapped, saved)
+
+
+def _require(found: Any, saved: Any, what: str) -> None:
+    if found != saved:
+        raise ValueError(f"env is not built like the one whose state was saved: {what} {found}, saved {saved}")
+
+
+def _name(layer: object) -> str:
+    return f"{type(layer).__module__}.{type(layer).__qualname__}"
+
+
+def _attributes(layer: Any, names: tuple[str, ...] | None) -> dict[str, Any]:
+    if names is None:
+        raise _Unknown
+    values = {name: vars(layer)[name] for name in names if name in vars(layer)}
+    return {"class": _name(layer), "values": copy.deepcopy(values)}
+
+
+def _layers(env: gym.Env) -> list[gym.Env]:
+    """The wrappers from the outside in, then the environment itself."""
+    layers = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    return layers
+
+
+# --- one environment --------------------------------------------------------------------------------------------
+
+
+def _save_env(env: gym.Env) -> dict[str, Any]:
+    *around, base = _layers(env)
+    layers = [_attributes(layer, _wrapper_state(layer)) for layer in around]
+    kind = _kind(base)
+    saved: dict[str, Any] = {"kind": kind, "np_random": None}
+    if kind == "own":
+        layers.append(_attributes(base, ()))
+        saved["simulation"] = copy.deepcopy(base.get_state())  # type: ignore[attr-defined]
+    elif kind == "plain":
+        layers.append(_attributes(base, _ENVS[type(base)]))
+    else:
+        layers.append(_attributes(base, _MUJOCO))
+        # All of MjData: tasks read derived quantities, such as the place of a body, before the next step renews them.
+        saved["simulation"] = pickle.dumps(base.data)  # type: ignore[attr-defined]
+    if base._np_random is not None:
+        saved["np_random"] = copy.deepcopy((base._np_random.bit_generator.state, base._np_random_seed))
+    return saved | {"layers": layers}
+
+
+def _wrapper_state(layer: gym.Env) -> tuple[str, ...] | None:
+    if type(layer) in _WRAPPERS:
+        return _WRAPPERS[type(layer)]  # type: ignore[index]
+    # A wrapper that holds nothing of its own has nothing to save.
+    own = vars(layer).keys() - vars(gym.Wrapper(gym.Env())).keys() - {"_saved_kwargs"}
+    return None if own else ()
+
+
+def _kind(base: gym.Env) -> Any:
+    """How the environment's state is read; for MuJoCo also the layout of the model."""
+    if callable(getattr(base, "get_state", None)) and _takes_one(getattr(base, "set_state", None)):
+        return "own"
+    if type(base) in _ENVS:
+        return "plain"
+    if hasattr(base, "model") and type(base).__module__.startswith(("gymnasium.envs.mujoco.", "sb3_rpto.envs.")):
+        return tuple(int(getattr(base.model, name)) for name in _MUJOCO_SIZES)
+    raise _Unknown
+
+
+def _takes_one(method: Any) -> bool:
+    """Whether ``method(state)`` is a valid call; MujocoEnv.set_state takes positions and velocities."""
+    try:
+        inspect.signature(method).bind(None)
+    except TypeError:
+        return False
+    return True
+
+
+def _restore_simulation(base: gym.Env, saved: dict[str, Any]) -> None:
+    if saved["np_random"] is not None:
+        stream, seed = saved["np_random"]
+        base._np_random = np.random.Generator(getattr(np.random, stream["bit_generator"])())
+        base._np_random.bit_generator.state = copy.deepcopy(stream)
+        base._np_random_seed = seed
+    if saved["kind"] == "own":
+        base.set_state(copy.deepcopy(saved["simulation"]))  # type: ignore[attr-defined]
+    elif saved["kind"] != "plain":
+        import mujoco
+
+        mujoco.mj_copyData(base.data, base.model, pickle.loads(saved["simulation"]))  # type: ignore[attr-defined]
+
+
+# --- trial copies -----------------------------------------------------------------------------------------------
+
+
+def copy_env(env: VecEnv) -> gym.Env | None:
+    """Copy the first environment of ``env`` with all its wrappers, to try things without touching the original.
+
+    The copy draws no pictures and writes no files. (Python's own deep copy of a gymnasium MuJoCo task makes a new
+    one from the constructor's arguments, which loses every later change of the model.)
+
+    :param env: the environment, untouched
+    :return: the copy, or None when it cannot be made (subprocesses, contents that do not copy)
+    """
+    base = env.unwrapped
+    if not isinstance(base, DummyVecEnv):
+        return None
+    try:
+        return _clone(base.envs[0], {})
+    except Exception:  # whatever the contents of a user's environment raise when copied
+        return None
+
+
+def _clone(env: gym.Env, memo: dict[int, Any]) -> gym.Env:
+    if isinstance(env, wrappers.RecordVideo | wrappers.HumanRendering | wrappers.RenderCollection):
+        return _clone(env.env, memo)
+    twin = object.__new__(type(env))
+    memo[id(env)] = twin
+    for name, value in vars(env).items():
+        if isinstance(value, gym.Env):
+            copied = memo[id(value)] if id(value) in memo else _clone(value, memo)
+        elif name in _HANDLES:
+            copied = None
+        elif type(value).__module__.startswith("mujoco.") and type(value).__name__ == "MjData":
+            copied = _clone_data(value, copy.deepcopy(vars(env)["model"], memo))
+        else:
+            copied = copy.deepcopy(value, memo)
+        vars(twin)[name] = copied
+    if not isinstance(twin, gym.Wrapper):
+        twin.render_mode = None
+    return twin
+
+
+def _clone_data(data: Any, model: Any) -> Any:
+    """A copy of MjData that steps the copied model."""
+    import mujoco
+
+    return mujoco.mj_copyData(mujoco.MjData(model), model, data)
+
+
+def accepts_seed(env: gym.Env) -> bool:
+    """Whether ``env.reset(seed=...)`` works, looking inward where a wrapper only hands its arguments on.
+
+    :param env: an environment; it is not reset
+    """
+    for layer in _layers(env):
+        parameters = inspect.signature(layer.reset).parameters
+        named = "seed" in parameters
+        if not named and not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
+            return False
+        # gymnasium's and SB3's wrappers pass the seed on; another wrapper that names it answers for itself.
+        if named and not type(layer).reset.__module__.startswith(("gymnasium.", "stable_baselines3.")):
+            return True
+    return True
+
+
+def replay_differs(
+    source_copy: gym.Env,
+    seed: int | None,
+    first_obs: np.ndarray,
+    actions: Sequence[np.ndarray],
+    next_obs_list: Sequence[np.ndarray],
+) -> bool | None:
+    """Whether the source, started as the target was, answers the same actions differently.
+
+    Observations count as equal up to float32 rounding (1e-6 relative).
+
+    :param source_copy: what :func:`copy_env` returned; it is reset and stepped
+    :param seed: the seed of the target's reset
+    :param first_obs: (observation_dim,), what the target's reset returned
+    :param actions: the first actions of that episode, as the target received them
+    :param next_obs_list: the target's answer to each
+    :return: None when nothing can be said: no seed, no actions, or the first observations differ
+    """
+    if seed is None or not len(actions):
+        return None
+    observation, _ = source_copy.reset(seed=seed)
+    if not _same(observation, first_obs):
+        return None
+    last = len(actions) - 1
+    for index, (action, expected) in enumerate(zip(actions, next_obs_list)):
+        observation, _, terminated, truncated, _ = source_copy.step(action)
+        if not _same(observation, expected):
+            return True
+        if terminated and index < last:  # the target went on
+            return True
+        if truncated:
+            break
+    return False
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    one, other = np.asarray(one, np.float64), np.asarray(other, np.float64)
+    return one.shape == other.shape and np.allclose(one, other, rtol=1e-6, atol=1e-7, equal_nan=True)
