@@ -108,8 +108,8 @@ def state_distribution(mdp: TabularMDP, policy: FloatArray, t: int) -> FloatArra
 def occupancy(mdp: TabularMDP, policy: FloatArray) -> FloatArray:
     """d(s) = (1 - gamma) sum_t gamma^t p_t(s), shape (S,), sums to 1."""
     chain = _under(mdp, policy)
-    visits: FloatArray = np.linalg.solve(np.eye(len(chain)) - mdp.gamma * chain.T, mdp.initial)
-    return (1 - mdp.gamma) * visits
+    visits = np.linalg.solve(np.eye(len(chain)) - mdp.gamma * chain.T, mdp.initial)
+    return np.asarray((1 - mdp.gamma) * visits, dtype=np.float64)
 
 
 def total_variation(first: FloatArray, second: FloatArray) -> float:
@@ -539,7 +539,7 @@ def _mutate(setting: Setting, rng: np.random.Generator) -> Setting:
 
 
 def worst_case(statement: Callable[[Setting], Bound], seed: int, steps: int) -> tuple[Bound, Setting]:
-    """Climb to a setting with the largest lhs / rhs, from several random starts and without gradients.
+    """Climb to a setting with the largest lhs / rhs without gradients, from one random start at each of four discounts.
 
     :param statement: one of :data:`STATEMENTS`
     :param seed: makes the search reproducible
@@ -550,12 +550,14 @@ def worst_case(statement: Callable[[Setting], Bound], seed: int, steps: int) -> 
     def score(bound: Bound) -> float:
         return bound.lhs / max(bound.rhs, 1e-4)
 
-    starts, found = 4, []
-    for start in range(starts):
+    gammas, found = (0.05, 0.3, 0.6, 0.9), []
+    for start, gamma in enumerate(gammas):
         rng = np.random.default_rng([seed, start])
-        best = random_setting(rng, 3 * start)
+        drawn = random_setting(rng, 0)
+        mdps = [replace(mdp, gamma=gamma) for mdp in (drawn.target, drawn.source, drawn.old_source)]
+        best = Setting(*mdps, drawn.policy, drawn.old_policy)
         bound = statement(best)
-        for _ in range(steps // starts):
+        for _ in range(steps // len(gammas)):
             candidate = _mutate(best, rng)
             value = statement(candidate)
             if score(value) >= score(bound):

@@ -30,8 +30,6 @@ DECLARABLE: dict[str, tuple[float, float] | None] = {
 
 #: Only the newest transitions are fitted: a handful of constants is known long before.
 MAX_TRANSITIONS = 5000
-#: Steps of one fit when the caller sets no cap; enough to cross the default bounds at the default ``max_step``.
-MAX_STEPS = 2000
 #: Directions whose curvature is below this share of the largest count as not identified by the data.
 SINGULAR = 1e-8
 
@@ -92,6 +90,7 @@ class PhysicalDynamics(Dynamics):
     :param declared: names of the constants to train, out of :data:`DECLARABLE`
     :param bounds: (lower, upper) of declared constants in their units; default: :data:`DECLARABLE`'s
     :param max_step: largest change of a coordinate in one step; 0.0025 doubles a constant in about 280 steps
+    :param max_steps: bounded steps that a fit takes at most, unless it is told otherwise
     :raises ValueError: for spaces that are not a cart-pole's, unknown or repeated names, bounds that are empty,
         infinite, unphysical or do not hold the nominal value, and ``max_step`` <= 0
     """
@@ -113,6 +112,7 @@ class PhysicalDynamics(Dynamics):
         declared: Sequence[str] = ("pole_length",),
         bounds: Mapping[str, tuple[float, float]] | None = None,
         max_step: float = 0.0025,
+        max_steps: int = 2000,
     ) -> None:
         super().__init__(observation_space, action_space)
         if observation_space.shape != (4,) or action_space.shape != (1,):
@@ -127,6 +127,7 @@ class PhysicalDynamics(Dynamics):
         self.declared = _checked_names(declared)
         self.bounds = _checked_bounds(self.declared, self.nominal, bounds or {})
         self.max_step = max_step
+        self.max_steps = max_steps
 
         lower, upper = th.tensor([self.bounds[name] for name in self.declared], dtype=th.float64).T
         nominal = th.tensor([self.nominal[name] for name in self.declared], dtype=th.float64)
@@ -208,7 +209,7 @@ class PhysicalDynamics(Dynamics):
 
         :param data: transitions, oldest first; the newest :data:`MAX_TRANSITIONS` with a positive weight are used
         :param weights: (n,), one non-negative weight a transition; None weighs all alike
-        :param max_steps: cap of steps; None takes :data:`MAX_STEPS`
+        :param max_steps: cap of steps; None takes the constructor's
         :return: ``loss`` (mean weighted squared error after the fit), ``steps`` taken, and for every declared constant
             its value and standard error ``<name>_se`` (see :meth:`_standard_errors`; infinite where the data do not
             determine it)
@@ -229,7 +230,7 @@ class PhysicalDynamics(Dynamics):
 
         phi = self.coordinates.detach().double()
         here = linearise(phi)
-        limit = MAX_STEPS if max_steps is None else max_steps
+        limit = self.max_steps if max_steps is None else max_steps
         damping, steps = SINGULAR, 0
         while steps < limit:
             candidate = self._propose(phi, here, damping)

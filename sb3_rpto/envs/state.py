@@ -15,7 +15,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import wrappers
 from gymnasium.envs.classic_control import Continuous_MountainCarEnv, PendulumEnv
-from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.monitor import Monitor, ResultsWriter
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
@@ -48,9 +49,7 @@ _VECTORISED = ("buf_obs", "buf_dones", "buf_rews", "buf_infos", "reset_infos", "
 # Beside the simulation, gymnasium's MuJoCo tasks keep these; Pusher writes the drawn object's place into init_qpos.
 _MUJOCO = ("init_qpos", "init_qvel", "goal", "goal_pos", "cylinder_pos")
 _MUJOCO_SIZES = ("signature", "nq", "nv", "nu", "na")
-
-# Windows and files belong to the original; a copy has none.
-_HANDLES = {"mujoco_renderer", "results_writer", "screen", "clock", "surf", "viewer"}
+_FORWARDING = ("gymnasium.", "stable_baselines3.", "sb3_rpto.")  # whose wrappers hand a seed on
 
 
 class _Unknown(Exception):
@@ -90,12 +89,12 @@ def restore_state(env: VecEnv, state: dict[str, Any]) -> None:
     :param state: what :func:`save_state` returned
     :raises ValueError: when ``env`` is not built like the saved one; nothing is changed then
     """
-    vec_layers: list[VecEnv] = []
+    vec_layers: list[Any] = []
     while isinstance(env, VecEnvWrapper):
         vec_layers.append(env)
         env = env.venv
     members = env.envs if type(env) is DummyVecEnv else []
-    plan = list(zip(vec_layers, state["vec_wrappers"], strict=False))
+    plan: list[tuple[Any, dict[str, Any]]] = list(zip(vec_layers, state["vec_wrappers"]))
     _require(len(vec_layers), len(state["vec_wrappers"]), "VecEnv wrappers")
     _require(len(members), len(state["envs"]), "environments in a DummyVecEnv")
     for member, saved in zip(members, state["envs"]):
@@ -106,7 +105,8 @@ def restore_state(env: VecEnv, state: dict[str, Any]) -> None:
     for layer, saved in plan:
         _require(_name(layer), saved["class"], "layer")
     for layer, saved in [*plan, (env, state["buffers"])]:
-        vars(layer).update(copy.deepcopy(saved["values"]))
+        for name, value in saved["values"].items():
+            _assign(layer, name, value)
     for member, saved in zip(members, state["envs"]):
         _restore_simulation(member.unwrapped, saved)
 
@@ -125,6 +125,17 @@ def _attributes(layer: Any, names: tuple[str, ...] | None) -> dict[str, Any]:
         raise _Unknown
     values = {name: vars(layer)[name] for name in names if name in vars(layer)}
     return {"class": _name(layer), "values": copy.deepcopy(values)}
+
+
+def _assign(layer: Any, name: str, value: Any) -> None:
+    current = vars(layer).get(name)
+    if isinstance(current, RunningMeanStd):  # in place: the target's VecNormalize may share it
+        vars(current).update(copy.deepcopy(vars(value)))
+    elif isinstance(current, dict) and name == "obs_rms":
+        for key in current:
+            vars(current[key]).update(copy.deepcopy(vars(value[key])))
+    else:
+        vars(layer)[name] = copy.deepcopy(value)
 
 
 def _layers(env: gym.Env) -> list[gym.Env]:
@@ -228,9 +239,9 @@ def _clone(env: gym.Env, memo: dict[int, Any]) -> gym.Env:
     for name, value in vars(env).items():
         if isinstance(value, gym.Env):
             copied = memo[id(value)] if id(value) in memo else _clone(value, memo)
-        elif name in _HANDLES:
+        elif _is_handle(value):
             copied = None
-        elif type(value).__module__.startswith("mujoco.") and type(value).__name__ == "MjData":
+        elif type(value).__name__ == "MjData":
             copied = _clone_data(value, copy.deepcopy(vars(env)["model"], memo))
         else:
             copied = copy.deepcopy(value, memo)
@@ -240,11 +251,19 @@ def _clone(env: gym.Env, memo: dict[int, Any]) -> gym.Env:
     return twin
 
 
+def _is_handle(value: Any) -> bool:
+    """Windows and files belong to the original."""
+    module = type(value).__module__
+    return isinstance(value, ResultsWriter) or module.startswith(("pygame", "gymnasium.envs.mujoco.mujoco_rendering"))
+
+
 def _clone_data(data: Any, model: Any) -> Any:
     """A copy of MjData that steps the copied model."""
     import mujoco
 
-    return mujoco.mj_copyData(mujoco.MjData(model), model, data)
+    twin = mujoco.MjData(model)
+    mujoco.mj_copyData(twin, model, data)
+    return twin
 
 
 def accepts_seed(env: gym.Env) -> bool:
@@ -257,8 +276,8 @@ def accepts_seed(env: gym.Env) -> bool:
         named = "seed" in parameters
         if not named and not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
             return False
-        # gymnasium's and SB3's wrappers pass the seed on; another wrapper that names it answers for itself.
-        if named and not type(layer).reset.__module__.startswith(("gymnasium.", "stable_baselines3.")):
+        # Another wrapper that names the seed answers for it.
+        if named and not type(layer).reset.__module__.startswith(_FORWARDING):
             return True
     return True
 

@@ -1,0 +1,339 @@
+"""Algorithm 1's bookkeeping: budgets, worlds, checks, logs."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import ALGORITHMS, SMALL_ENSEMBLE, pendulum, small
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_rpto import RPO, RPTO, RTO
+from sb3_rpto.buffers import chronological
+
+
+class CountingPendulum(gym.Wrapper):
+    """Counts its own steps, whoever takes them."""
+
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        return super().step(action)
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_exactly_the_budget_is_spent_in_the_target(cls):
+    target = CountingPendulum(pendulum(12.0))
+    model = small(cls, target=target)
+    model.learn(77, source_timesteps=20)
+    assert target.steps == model.num_timesteps == model.replay_buffer.size() == 77
+    assert model.target_spent == {"learning": 77}
+    model.learn(23, reset_num_timesteps=False)
+    assert target.steps == model.num_timesteps == 100
+    assert model.source_timesteps > 77 * 8
+
+
+@pytest.mark.parametrize(("train_freq", "n_envs", "budget", "spent"), [(10, 1, 25, 25), (3, 4, 50, 48), (1, 3, 10, 9)])
+def test_the_budget_is_never_exceeded(train_freq, n_envs, budget, spent):
+    targets = [CountingPendulum(pendulum(12.0)) for _ in range(n_envs)]
+    vec = DummyVecEnv([lambda env=env: Monitor(env) for env in targets])
+    model = small(RPO, target=vec, train_freq=train_freq)
+    model.learn(budget, source_timesteps=0)
+    assert sum(env.steps for env in targets) == model.num_timesteps == spent
+
+
+def test_updates_are_counted_per_target_step():
+    for gradient_steps, train_freq, expected in ((3, 1, 60), (2, 10, 40), (-1, 10, 20), (0, 1, 0)):
+        model = small(RPO, gradient_steps=gradient_steps, train_freq=train_freq)
+        model.learn(20, source_timesteps=0)
+        assert model._n_updates == expected
+
+
+def test_episodic_training_updates_between_episodes_only():
+    class Watch(BaseCallback):
+        def _on_step(self):
+            self.updates_during_episodes = self.model._n_updates
+            return True
+
+    watch = Watch()
+    model = small(RPO, train_freq=(1, "episode"), gradient_steps=-1)
+    model.learn(250, callback=watch, source_timesteps=0)  # episodes take 200 steps, the budget ends in the second
+    assert watch.updates_during_episodes == 200
+    assert model._n_updates == 250
+
+
+def test_no_random_action_in_the_target():
+    """A policy that always pushes right must be seen from the first target step, whatever learning_starts says."""
+    model = small(RPO, learning_starts=1000)
+    for parameter in model.actor.mu.parameters():
+        parameter.data.zero_()
+    model.actor.mu.bias.data.fill_(10.0)
+    model.actor.log_std.bias.data.fill_(-20.0)
+    model.actor.log_std.weight.data.zero_()
+    model.gradient_steps = 0
+    model.learn(30, source_timesteps=0)
+    assert chronological(model.replay_buffer.target)["actions"].min() > 0.99
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_a_fresh_model_trains_in_the_source_first_and_once(cls):
+    calls = []
+
+    class Count(BaseCallback):
+        def _on_step(self):
+            calls.append(self.num_timesteps)
+            return True
+
+    target = CountingPendulum(pendulum(12.0))
+    model = small(cls, target=target)
+    model.learn(10, callback=Count(), source_timesteps=150)
+    assert model._pretrained_steps == 150
+    assert calls == list(range(1, 11))
+    assert target.steps == 10
+    before = model.source_timesteps
+    model.learn(10, reset_num_timesteps=False, source_timesteps=150)
+    assert model.source_timesteps - before == 10 * 8
+    assert model._pretrained_steps == 150
+
+
+def test_the_source_phase_is_plain_sac():
+    """Same seed, same environment: the phase leaves the parameters that SB3's SAC has after as many steps."""
+    kwargs = {"policy_kwargs": {"net_arch": [16]}, "batch_size": 32, "learning_starts": 20, "seed": 5, "device": "cpu"}
+    sac = SAC("MlpPolicy", pendulum(), **kwargs).learn(60)
+    model = RPO("MlpPolicy", pendulum(), target_env=pendulum(12.0), gradient_steps=0, **kwargs)
+    model.learn(1, source_timesteps=60)
+    for name, value in sac.policy.state_dict().items():
+        np.testing.assert_allclose(model.snapshots["source"]["policy"][name], value, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_callbacks_can_stop(cls):
+    model = small(cls)
+    model.learn(1000, callback=StopTrainingOnMaxEpisodes(1), source_timesteps=0)
+    assert model.num_timesteps == 200
+
+
+def test_defaults_of_learn_count_target_steps():
+    import inspect
+
+    parameters = inspect.signature(RPTO.learn).parameters
+    assert parameters["total_timesteps"].default == 10_000
+    assert parameters["source_timesteps"].kind is inspect.Parameter.KEYWORD_ONLY
+
+
+def test_the_signature_is_sacs_then_ours():
+    import inspect
+
+    sac = inspect.signature(SAC.__init__).parameters
+    for cls in ALGORITHMS:
+        ours = inspect.signature(cls.__init__).parameters
+        assert list(ours)[: len(sac)] == list(sac)
+        for name, parameter in sac.items():
+            assert ours[name].default == parameter.default, name
+        assert all(ours[name].kind is inspect.Parameter.KEYWORD_ONLY for name in list(ours)[len(sac) :])
+
+
+def test_logged_keys_are_those_of_the_docs():
+    model = small(RPTO, model_train_freq=100)
+    model.set_logger(configure(None, []))
+    seen = set()
+    dump = model.logger.dump
+
+    def keep(step=0):
+        seen.update(model.logger.name_to_value)
+        dump(step)
+
+    model.logger.dump = keep
+    model.learn(450, source_timesteps=100, log_interval=1)
+    expected = {
+        *("rollout/ep_rew_mean", "rollout/ep_len_mean", "time/episodes", "time/fps", "time/total_timesteps"),
+        *("time/source_timesteps", "train/actor_loss", "train/critic_loss", "train/ent_coef", "train/ent_coef_loss"),
+        *("dynamics/error", "dynamics/error_before", "rto/effective_samples", "pretrain/timesteps"),
+    }
+    assert expected <= seen
+    assert all(len(key) <= 33 and key == key.lower() for key in seen)
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_a_target_equal_to_the_source_is_noticed_without_a_step(cls):
+    target = CountingPendulum(pendulum())
+    env = gym.make("Pendulum-v1", g=10.0)
+    with pytest.warns(UserWarning, match="exactly like env"):
+        small(cls, env, pendulum()).learn(30, source_timesteps=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        small(RPO, env, pendulum(10.01)).learn(30, source_timesteps=0)
+    model = small(RPO, env, target)
+    model.learn(30, source_timesteps=0)
+    assert target.steps == 30
+
+
+def test_sides_of_data_hold_what_their_world_does():
+    """g = 0 and no torque effect in the source: its transitions differ visibly from the target's."""
+    model = small(RPO, pendulum(0.001), pendulum(20.0))
+    model.learn(60, source_timesteps=0)
+
+    def gravity(arrays):  # thdot' = thdot + (3g/2 sin th + 3u) dt
+        sin, speed = arrays["observations"][:, 1], arrays["observations"][:, 2]
+        torque = 2 * arrays["actions"][:, 0]
+        keep = (np.abs(sin) > 0.3) & (np.abs(arrays["next_observations"][:, 2]) < 7.9)
+        g = ((arrays["next_observations"][:, 2] - speed) / 0.05 - 3 * torque) / (1.5 * sin)
+        return np.median(g[keep])
+
+    assert gravity(chronological(model.replay_buffer.source)) == pytest.approx(0.0, abs=0.1)
+    assert gravity(chronological(model.replay_buffer.target)) == pytest.approx(20.0, abs=0.1)
+
+
+def test_vec_normalize_statistics_are_the_sources_alone():
+    source = VecNormalize(make_vec_env(pendulum, n_envs=2, seed=0))
+    model = small(RPTO, source, pendulum(12.0))
+    model.learn(40, source_timesteps=60)
+    shared = model.target_env
+    assert shared.obs_rms is source.obs_rms
+    assert not shared.training
+    counted = source.obs_rms.count
+    assert counted == pytest.approx(model._pretrained_steps + 300 + 3 * 2, abs=12)
+    speeds = chronological(model.replay_buffer.target)["observations"][:, :2]
+    np.testing.assert_allclose((speeds**2).sum(1), 1.0, atol=1e-5)  # cos, sin: stored raw
+    model.set_env(VecNormalize(make_vec_env(pendulum, n_envs=2, seed=1)))
+    assert model.target_env.obs_rms is model.env.obs_rms is not source.obs_rms
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_several_source_environments(cls):
+    model = small(cls, make_vec_env(pendulum, n_envs=3, seed=0), pendulum(12.0))
+    model.learn(30, source_timesteps=60)
+    assert model.num_timesteps == 30
+    assert model.get_env().num_envs == 3
+
+
+def test_the_best_policy_is_kept_and_can_be_brought_back():
+    model = small(RPO, gradient_steps=1)
+    model.learn(1200, source_timesteps=0)
+    assert set(model.snapshots) == {"source", "best"}
+    assert np.isfinite(model.best_mean_reward)
+    now = model.predict(np.ones(3), deterministic=True)[0]
+    model.rollback("source")
+    source = model.predict(np.ones(3), deterministic=True)[0]
+    assert not np.allclose(now, source)
+    fresh = small(RPO)
+    np.testing.assert_allclose(source, fresh.predict(np.ones(3), deterministic=True)[0])
+    with pytest.raises(ValueError, match="best"):
+        fresh.rollback("best")
+
+
+class NaNAt(gym.Wrapper):
+    """Answers NaN at one step."""
+
+    def __init__(self, env, at):
+        super().__init__(env)
+        self.at, self.count = at, 0
+
+    def step(self, action):
+        obs, reward, *rest = super().step(action)
+        self.count += 1
+        return (obs * np.nan if self.count == self.at else obs), reward, *rest
+
+
+class NoSeed(gym.Env):
+    observation_space = spaces.Box(-1, 1, (3,))
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def reset(self):
+        return np.zeros(3, np.float32), {}
+
+
+class DictEnv(gym.Env):
+    observation_space = spaces.Dict({"a": spaces.Box(-1, 1, (3,))})
+    action_space = spaces.Box(-1, 1, (1,))
+
+
+def test_bad_input_is_refused_at_construction():
+    env = pendulum()
+    with pytest.raises(ValueError, match="target_env is env"):
+        small(RPTO, env, env)
+    with pytest.raises(ValueError, match="observation_space"):
+        small(RPO, env, gym.make("MountainCarContinuous-v0"))
+    with pytest.raises(ValueError, match=r"env: reset\(\) .* takes no seed"):
+        small(RPO, NoSeed())
+    with pytest.raises(NotImplementedError, match="FlattenObservation"):
+        small(RPO, DictEnv())
+    with pytest.raises(NotImplementedError, match="continuous"):
+        small(RPO, gym.make("CartPole-v1"))
+    with pytest.raises(NotImplementedError, match="n_steps"):
+        small(RPO, n_steps=3)
+    with pytest.raises(ValueError, match="preset='papre'"):
+        small(RPTO, preset="papre")
+    with pytest.raises(ValueError, match="weighting"):
+        small(RPTO, weighting="centered")
+    with pytest.raises(ValueError, match="rollout_start"):
+        small(RPTO, rollout_start="middle")
+    with pytest.raises(ValueError, match="dynamics"):
+        RPTO("MlpPolicy", env, dynamics="gp")
+    with pytest.raises(ValueError, match="real_ratio"):
+        small(RPTO, real_ratio=1.5)
+    with pytest.raises(ValueError, match="weight_floor"):
+        small(RPTO, weight_floor=-1.0)
+    with pytest.raises(ValueError, match="source_steps"):
+        small(RPTO, source_steps=0)
+    with pytest.raises(ValueError, match="RPO does not use"):
+        RPO("MlpPolicy", env, weighting=None)
+    with pytest.raises(ValueError, match="physical"):
+        RPTO("MlpPolicy", env, declared=["pole_length"])
+    with pytest.raises(TypeError, match="weihgting"):
+        RPTO("MlpPolicy", env, weihgting=None)
+
+
+def test_bad_input_is_refused_before_learning():
+    with pytest.raises(ValueError, match="target_env="):
+        RPO("MlpPolicy", pendulum()).learn(10)
+    for budget in (0, -5):
+        with pytest.raises(ValueError, match="total_timesteps"):
+            small(RPO).learn(budget)
+    with pytest.raises(ValueError, match="source_timesteps"):
+        small(RPO).learn(10, source_timesteps=-1)
+    with pytest.raises(ValueError, match="4 environments"):
+        small(RPO, target=make_vec_env(pendulum, n_envs=4)).learn(3)
+
+
+@pytest.mark.parametrize("world", ["source", "target"])
+def test_nan_from_an_environment_names_the_world(world):
+    broken, sound = NaNAt(pendulum(), 40), pendulum(12.0)
+    model = small(RPO, broken, sound) if world == "source" else small(RPO, sound, broken)
+    with pytest.raises(ValueError, match=f"{world} environment returned a observation|{world} environment returned"):
+        model.learn(100, source_timesteps=0)
+
+
+def test_offline_data_stand_in_for_the_target(tmp_path):
+    recorder = SAC("MlpPolicy", pendulum(12.0), policy_kwargs={"net_arch": [16]}, learning_starts=300, seed=0).learn(300)
+    model = RPTO(
+        "MlpPolicy",
+        pendulum(),
+        target_data=recorder.replay_buffer,
+        policy_kwargs={"net_arch": [16]},
+        dynamics_kwargs=SMALL_ENSEMBLE,
+        model_train_freq=20,
+        source_steps=10,
+        batch_size=32,
+        seed=0,
+    )
+    assert model.replay_buffer.size() == 300
+    model.learn(400, source_timesteps=50)
+    assert 400 <= model.num_timesteps < 420
+    assert model.replay_buffer.size() == 300
+    assert model._n_updates == 40
+    with pytest.raises(ValueError, match="RPO does not use"):
+        RPO("MlpPolicy", pendulum(), target_data=recorder.replay_buffer)
+
+
+@pytest.mark.parametrize("cls", [RTO, RPTO])
+@pytest.mark.parametrize("weighting", ["paper", "centred", "value_aware", None])
+def test_every_weighting_runs(cls, weighting):
+    small(cls, weighting=weighting).learn(60, source_timesteps=0)

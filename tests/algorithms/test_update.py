@@ -1,0 +1,111 @@
+"""SB3's own SAC is the oracle of the update."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch as th
+from conftest import ALGORITHMS, pendulum, small
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import configure
+
+from sb3_rpto import RPO, RPTO, RTO
+from sb3_rpto.algorithms.update import ALTERNATION
+
+
+def filled_sac(**kwargs) -> SAC:
+    sac = SAC(
+        "MlpPolicy", pendulum(), policy_kwargs={"net_arch": [16]}, batch_size=32, learning_starts=40, seed=0, device="cpu", **kwargs
+    )
+    return sac.learn(60)
+
+
+def twin_of(cls, sac: SAC, monkeypatch, **kwargs):
+    """One of ours with SAC's state, which sees SAC's minibatches."""
+    model = cls.from_source(sac, pendulum(), pendulum(12.0), seed=1, device="cpu", **kwargs)
+    model.set_logger(configure(None, []))
+
+    def batches(batch_size):
+        batch = sac.replay_buffer.sample(batch_size, env=sac.get_vec_normalize_env())
+        return batch, batch
+
+    monkeypatch.setattr(model, "sample_batches", batches)
+    return model
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {},
+        {"ent_coef": 0.2},
+        {"ent_coef": "auto_0.5", "target_update_interval": 3},
+        {"use_sde": True},
+        {"learning_rate": lambda left: 1e-3 * left + 1e-4},
+    ],
+    ids=["auto", "fixed", "interval", "gsde", "schedule"],
+)
+def test_given_the_same_minibatches_the_update_is_sacs(kwargs, monkeypatch):
+    sac = filled_sac(**kwargs)
+    taken_over = {name: value for name, value in kwargs.items() if name == "target_update_interval"}
+    model = twin_of(RPO, sac, monkeypatch, **taken_over)
+    for algorithm in (sac, model):
+        np.random.seed(3)
+        th.manual_seed(3)
+        algorithm._current_progress_remaining = 0.5
+        algorithm.train(gradient_steps=25, batch_size=32)
+    for name, ours in model.policy.state_dict().items():
+        assert th.equal(ours, sac.policy.state_dict()[name]), name
+    assert th.equal(model.temperature(), sac.log_ent_coef.exp() if sac.log_ent_coef is not None else sac.ent_coef_tensor)
+    for name in ("train/actor_loss", "train/critic_loss", "train/learning_rate"):
+        assert model.logger.name_to_value[name] == pytest.approx(sac.logger.name_to_value[name], rel=1e-6), name
+
+
+def test_rto_moves_the_critic_and_leaves_policy_and_temperature(monkeypatch):
+    sac = filled_sac()
+    model = twin_of(RTO, sac, monkeypatch, dynamics_kwargs={"hidden": (16,)})
+    before = copy.deepcopy(model.policy.state_dict())
+    alpha = model.temperature()
+    model.train(10, 32)
+    after = model.policy.state_dict()
+    assert all(th.equal(before[name], after[name]) for name in before if name.startswith("actor"))
+    assert any(not th.equal(before[name], after[name]) for name in before if name.startswith("critic."))
+    assert model.temperature() == alpha
+
+
+@pytest.mark.parametrize("cls", [RPO, RPTO])
+def test_the_actor_alternates_four_target_batches_and_one_source_batch(cls):
+    model = small(cls)
+    model.learn(64, source_timesteps=0)
+    model.replay_buffer.source.rewards[:] = -1.0
+    model.replay_buffer.target.rewards[:] = 1.0
+    worlds = [model.sample_batches(32)[1].rewards.mean().item() for _ in range(2 * ALTERNATION)]
+    assert sorted(worlds[:ALTERNATION]) == [-1, 1, 1, 1, 1]
+    assert worlds[:ALTERNATION] == worlds[ALTERNATION:]
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize(("ratio", "expected"), [(0.0, 0), (0.05, 2), (0.5, 16)])
+def test_the_critics_batch_holds_the_real_ratio_of_target_transitions(cls, ratio, expected):
+    model = small(cls, real_ratio=ratio)
+    model.learn(64, source_timesteps=0)
+    model.replay_buffer.source.rewards[:] = 0.0
+    model.replay_buffer.target.rewards[:] = 1.0
+    critic_batch, _ = model.sample_batches(32)
+    assert len(critic_batch.rewards) == 32
+    assert critic_batch.rewards.sum() == expected
+
+
+def test_values_for_the_weights_are_the_target_critics():
+    model = small(RPTO, ent_coef=0.1)
+    observations = th.randn(50, 3)
+    th.manual_seed(0)
+    ours = model.soft_value(observations)
+    th.manual_seed(0)
+    with th.no_grad():
+        actions, log_prob = model.actor.action_log_prob(observations)
+        q1, q2 = model.critic_target(observations, actions)
+    th.testing.assert_close(ours, th.minimum(q1, q2)[:, 0] - 0.1 * log_prob)
+    # Pendulum's torque is within 2 N m, the critic sees actions in [-1, 1]
+    th.testing.assert_close(
+        model.q_value(observations, 2 * actions), th.minimum(*model.critic_target(observations, actions))[:, 0]
+    )

@@ -1,0 +1,39 @@
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+import gymnasium as gym
+import pytest
+import torch as th
+
+from sb3_rpto import RPO, RPTO, RTO
+from sb3_rpto.algorithms import warm
+
+th.set_num_threads(1)
+
+ALGORITHMS = [RPO, RTO, RPTO]
+SMALL_POLICY = {"net_arch": [16]}
+SMALL_ENSEMBLE = {"hidden": (16, 16), "n_members": 3, "n_elites": 2, "max_steps": 30}
+
+
+@pytest.fixture(autouse=True)
+def _short_source_phase(monkeypatch):
+    """The collection for phi_0 takes 25,000 source steps; tests are served by fewer."""
+    monkeypatch.setattr(warm, "PHI_0_STEPS", 300)
+    monkeypatch.setattr(warm, "PHI_0_UPDATES", 30)
+    monkeypatch.setattr(warm, "FIRST_SOURCE_STEPS", 300)
+
+
+def pendulum(g: float = 10.0) -> gym.Env:
+    return gym.make("Pendulum-v1", g=g)
+
+
+def small(cls, env=None, target=None, **kwargs):
+    """An algorithm small enough for tests; RPO takes no dynamics."""
+    env = pendulum() if env is None else env
+    target = pendulum(12.0) if target is None else target
+    settings = {"policy_kwargs": SMALL_POLICY, "batch_size": 32, "seed": 0, "source_steps": 8, "device": "cpu"}
+    if cls.updates_dynamics and kwargs.get("dynamics", "ensemble") == "ensemble":
+        settings |= {"dynamics_kwargs": SMALL_ENSEMBLE, "model_train_freq": 50}
+    return cls("MlpPolicy", env, target_env=target, **{**settings, **kwargs})
