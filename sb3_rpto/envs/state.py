@@ -130,10 +130,10 @@ def _attributes(layer: Any, names: tuple[str, ...] | None) -> dict[str, Any]:
 def _assign(layer: Any, name: str, value: Any) -> None:
     current = vars(layer).get(name)
     if isinstance(current, RunningMeanStd):  # in place: the target's VecNormalize may share it
-        vars(current).update(copy.deepcopy(vars(value)))
+        current.__dict__.update(copy.deepcopy(vars(value)))
     elif isinstance(current, dict) and name == "obs_rms":
         for key in current:
-            vars(current[key]).update(copy.deepcopy(vars(value[key])))
+            current[key].__dict__.update(copy.deepcopy(vars(value[key])))
     else:
         vars(layer)[name] = copy.deepcopy(value)
 

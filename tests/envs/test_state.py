@@ -238,7 +238,9 @@ def test_another_mujoco_model_is_refused(tmp_path):
     path = tmp_path / "hopper.xml"
     source = gym.make("Hopper-v5").unwrapped.fullpath
     path.write_text(
-        Path(source).read_text().replace("</worldbody>", '<body><joint type="hinge"/><geom size=".1"/></body></worldbody>')
+        Path(source)
+        .read_text()
+        .replace("</worldbody>", '<body><joint type="hinge"/><geom size=".1"/></body></worldbody>')
     )
     other = make_vec_env("Hopper-v5", n_envs=2, env_kwargs={"xml_file": str(path), "max_episode_steps": 40})
     with pytest.raises(ValueError, match="kind of simulation"):
