@@ -84,7 +84,7 @@ class DynamicsEnv(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], g
         self._elapsed_steps = 0
 
     @property
-    def render_mode(self) -> None:
+    def render_mode(self) -> None:  # type: ignore[override]
         """Always None: the model has no picture."""
         return None
 

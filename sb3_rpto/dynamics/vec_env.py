@@ -91,7 +91,7 @@ class DynamicsVecEnv(VecEnv):
             truncated = self._elapsed_steps >= self.max_episode_steps
         dones = terminated | truncated
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
-        for index in np.flatnonzero(dones):
+        for index in np.flatnonzero(dones).tolist():
             infos[index] = {
                 "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
                 "terminal_observation": following[index].copy(),

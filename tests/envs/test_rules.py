@@ -48,8 +48,10 @@ def rollout(env, steps, seed=0, past_the_end=False):
     return [np.stack(column) for column in zip(*rows)]
 
 
-def compare(env, rules, steps=1200, past_the_end=True):
-    observations, actions, following, rewards, terminated = rollout(env, steps, past_the_end=past_the_end)
+def compare(env, rules, steps=1200):
+    # Beyond its end the double pendulum spins faster than its observation, clipped at 10 rad/s, tells.
+    double = "DoublePendulum" in str(env)
+    observations, actions, following, rewards, terminated = rollout(env, steps, past_the_end=not double)
     arguments = [th.as_tensor(part) for part in (observations, actions, following)]
     ended = rules.termination_fn(*arguments)
     assert ended.dtype == th.bool
@@ -58,7 +60,7 @@ def compare(env, rules, steps=1200, past_the_end=True):
     if rules.reward_fn is not None:
         predicted = rules.reward_fn(*arguments)
         assert predicted.shape == (steps,)
-        np.testing.assert_allclose(predicted.numpy(), rewards, rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(predicted.numpy(), rewards, rtol=1e-5, atol=5e-4 if double else 1e-5)
     return terminated
 
 
@@ -70,6 +72,14 @@ def test_rules_agree_with_the_environment(name):
     terminated = compare(env, rules)
     if name in ENDS:
         assert 0 < terminated.sum() < len(terminated)  # both answers were put to the test
+
+
+def test_the_tip_is_low_exactly_when_the_environment_says_so():
+    env = make("InvertedDoublePendulum-v5")
+    observations, actions, following, _, terminated = rollout(env, 3000, past_the_end=True)
+    arguments = [th.as_tensor(part) for part in (observations, actions, following)]
+    np.testing.assert_array_equal(task_rules(env).termination_fn(*arguments).numpy(), terminated)
+    assert 300 < terminated.sum() < 2700
 
 
 def test_mountain_car_goal_is_reached_exactly_when_the_environment_says_so():

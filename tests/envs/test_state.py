@@ -37,7 +37,8 @@ def build(name, n_envs=2, seed=0):
 
 def actions_for(env, steps, seed=0):
     rng = np.random.default_rng(seed)
-    low, high = env.action_space.low, env.action_space.high
+    space = env.unwrapped.envs[0].unwrapped.action_space  # ClipAction makes the outer one infinite
+    low, high = space.low, space.high
     return rng.uniform(low, high, size=(steps, env.num_envs, *low.shape)).astype(np.float32)
 
 
@@ -222,7 +223,7 @@ def test_a_state_of_another_build_is_refused_and_changes_nothing():
     env = build("Pendulum-v1")
     env.reset()
     state = save_state(env)
-    others = [build("Pendulum-v1", n_envs=1), build("MountainCarContinuous-v0"), VecMonitor(build("Pendulum-v1"))]
+    others = [build("Pendulum-v1", n_envs=1), build("MountainCarContinuous-v0"), VecNormalize(build("Pendulum-v1"))]
     others.append(DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 2))
     for other in others:
         other.reset()
@@ -240,7 +241,7 @@ def test_another_mujoco_model_is_refused(tmp_path):
     path.write_text(
         Path(source)
         .read_text()
-        .replace("</worldbody>", '<body><joint type="hinge"/><geom size=".1"/></body></worldbody>')
+        .replace("</worldbody>", '<body><joint type="hinge" range="-1 1"/><geom size=".1"/></body></worldbody>')
     )
     other = make_vec_env("Hopper-v5", n_envs=2, env_kwargs={"xml_file": str(path), "max_episode_steps": 40})
     with pytest.raises(ValueError, match="kind of simulation"):
@@ -259,10 +260,11 @@ def test_a_copy_steps_like_the_original_and_apart_from_it(name, tmp_path):
     env.seed(0)
     env.reset()
     actions = actions_for(env, 30)
-    run(env, actions[:10])
+    run(env, actions[:3])
     before = pickle.dumps(save_state(env))
     copies = copy_env(env), copy_env(VecNormalize(env))
     for copy in copies:
+        copy.reset()
         for action in actions[10:]:
             *_, terminated, truncated, _ = copy.step(action[0])
             if terminated or truncated:
@@ -272,12 +274,10 @@ def test_a_copy_steps_like_the_original_and_apart_from_it(name, tmp_path):
         assert copies[0].unwrapped.model is not env.envs[0].unwrapped.model
     copies = copy_env(env), copy_env(env)
     log = (tmp_path / "log.monitor.csv").read_text()
-    answers = [[copy.step(action[0])[:4] for action in actions[10:14]] for copy in copies]
-    for copied, original in zip(answers[0], (env.envs[0].step(action[0]) for action in actions[10:14])):
-        np.testing.assert_array_equal(copied[0], original[0])
-        assert copied[1:] == original[1:4]
-    assert (tmp_path / "log.monitor.csv").read_text().startswith(log)
-    np.testing.assert_equal(answers[0], answers[1])
+    answers = [[copy.step(action[0])[:4] for action in actions[10:12]] for copy in copies]
+    assert (tmp_path / "log.monitor.csv").read_text() == log
+    expected = [env.envs[0].step(action[0])[:4] for action in actions[10:12]]
+    np.testing.assert_equal(answers, [expected, expected])
 
 
 def test_what_cannot_be_copied_gives_none():
