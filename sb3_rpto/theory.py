@@ -555,7 +555,7 @@ def worst_case(statement: Callable[[Setting], Bound], seed: int, steps: int) -> 
         rng = np.random.default_rng([seed, start])
         drawn = random_setting(rng, 0)
         mdps = [replace(mdp, gamma=gamma) for mdp in (drawn.target, drawn.source, drawn.old_source)]
-        best = Setting(*mdps, drawn.policy, drawn.old_policy)
+        best = Setting(mdps[0], mdps[1], mdps[2], drawn.policy, drawn.old_policy)
         bound = statement(best)
         for _ in range(steps // len(gammas)):
             candidate = _mutate(best, rng)
