@@ -143,6 +143,10 @@ class EnsembleDynamics(Dynamics):
     run. A holdout transition never becomes a training one: the split depends on nothing but the transition's
     index.
 
+    Patience, snapshots and elites go by the squared error on the holdout, not by the likelihood: that is MBPO's choice
+    and gives the better means, but with few transitions the predicted variances become too small (``holdout_nll`` then
+    rises while ``holdout_rmse`` falls).
+
     :param observation_space: flat Box
     :param action_space: flat Box
     :param reward_fn: known reward (obs, act, next_obs) -> (n,), used by :meth:`step` in place of the learned head
