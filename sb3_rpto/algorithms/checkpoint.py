@@ -76,7 +76,16 @@ class Resumable(PolicySnapshots):
         self._warm = True
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["target_env", "dynamics", "_source_world", "_null_check", "_passed", "_last_obs", "_last_original_obs"]
+        own = [
+            "target_env",
+            "dynamics",
+            "_source_world",
+            "_null_check",
+            "_passed",
+            "_last_obs",
+            "_last_original_obs",
+            "_source_first_obs",
+        ]
         return [*super()._excluded_save_params(), *own]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -12,7 +12,6 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_rpto.algorithms.worlds import check_finite
 from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
-from sb3_rpto.envs.state import restore_state, save_state
 
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.transfer import TransferAlgorithm
@@ -24,13 +23,17 @@ class EpisodeSource:
     """Whole episodes of a source VecEnv: the real simulator (RPO) or one that the dynamics answer.
 
     :param env: stepped by the current stochastic policy
+    :param first_obs: the observation of a reset that was made already; None: reset before the first step
     """
 
-    def __init__(self, env: VecEnv) -> None:
+    _STATE = ("_last_obs", "_last_raw", "returns", "lengths")
+
+    def __init__(self, env: VecEnv, first_obs: np.ndarray | None = None) -> None:
         self.env = env
         self.returns: deque[float] = deque(maxlen=100)
         self.lengths: deque[int] = deque(maxlen=100)
-        self._last_obs: np.ndarray | None = None
+        self._last_obs = first_obs
+        self._last_raw: np.ndarray | None = None if first_obs is None else self._raw(first_obs)
 
     def interact(self, model: TransferAlgorithm, n_steps: int, random: bool = False) -> int:
         """Step at least ``n_steps`` times in all environments together and store every transition.
@@ -43,16 +46,17 @@ class EpisodeSource:
         normaliser = unwrap_vec_normalize(self.env)
         if self._last_obs is None:
             self._last_obs = self.env.reset()  # type: ignore[assignment]
+            self._last_raw = self._raw(self._last_obs)
         model.policy.set_training_mode(False)
         steps = 0
         while steps < n_steps:
-            raw_obs = normaliser.get_original_obs() if normaliser is not None else self._last_obs
             if random:
                 actions = np.array([self.env.action_space.sample() for _ in range(self.env.num_envs)])
             else:
                 actions, _ = model.policy.predict(self._last_obs, deterministic=False)
             new_obs, rewards, dones, infos = self.env.step(actions)
-            raw_next = np.array(normaliser.get_original_obs() if normaliser is not None else new_obs)
+            raw_obs, self._last_raw = self._last_raw, self._raw(new_obs)
+            raw_next = self._last_raw.copy()
             if normaliser is not None:
                 rewards = normaliser.get_original_reward()
             for i in np.flatnonzero(dones):
@@ -70,34 +74,28 @@ class EpisodeSource:
             steps += self.env.num_envs
         return steps
 
+    def _raw(self, obs: Any) -> np.ndarray:
+        normaliser = unwrap_vec_normalize(self.env)
+        return np.array(obs if normaliser is None else normaliser.get_original_obs())
+
     def log(self) -> dict[str, float]:
         """Mean return and length of the last 100 source episodes."""
         if not self.returns:
             return {}
         return {"ep_rew_mean": float(np.mean(self.returns)), "ep_len_mean": float(np.mean(self.lengths))}
 
-    def get_state(self) -> dict[str, Any] | None:
-        """Where the episodes stand, or None when the environments cannot say."""
+    def get_state(self) -> dict[str, Any]:
+        """Where the episodes stand, beside the source environment's own state."""
         inner = self.env.unwrapped
-        state = {"model": inner.get_state()} if isinstance(inner, DynamicsVecEnv) else {"env": save_state(self.env)}
-        if None in state.values():
-            return None
-        normaliser = unwrap_vec_normalize(self.env)
-        originals = {} if normaliser is None else {"old_obs": normaliser.old_obs, "old_reward": normaliser.old_reward}
-        return {**state, **originals, "last_obs": self._last_obs, "returns": self.returns, "lengths": self.lengths}
+        model = inner.get_state() if isinstance(inner, DynamicsVecEnv) else None
+        return {"model": model, **{name: getattr(self, name) for name in self._STATE}}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Continue where :meth:`get_state` was called."""
-        if "model" in state:
-            self.env.reset()
+        """Continue where :meth:`get_state` was called; the source environment's own state is restored elsewhere."""
+        if state["model"] is not None:
             self.env.unwrapped.set_state(state["model"])  # type: ignore[attr-defined]
-        else:
-            self.env.reset()
-            restore_state(self.env, state["env"])
-        normaliser = unwrap_vec_normalize(self.env)
-        if normaliser is not None:
-            normaliser.old_obs, normaliser.old_reward = state["old_obs"], state["old_reward"]
-        self._last_obs, self.returns, self.lengths = state["last_obs"], state["returns"], state["lengths"]
+        for name in self._STATE:
+            setattr(self, name, state[name])
 
 
 class BranchSource:

@@ -197,6 +197,7 @@ class TransferAlgorithm(Resumable):
         self._collected = 1
         self._since_fit = 0
         self._source_world: EpisodeSource | BranchSource | None = None
+        self._source_first_obs: np.ndarray | None = None
         self._null_check: NullShiftCheck | None = None
         self._resume_state: dict[str, Any] | None = None
 
@@ -497,7 +498,7 @@ class TransferAlgorithm(Resumable):
         )
         self.action_noise = noise
         if starts_episode:
-            self._source_world = None  # SB3 has just reset the source
+            self._source_world, self._source_first_obs = None, self._last_obs  # SB3 has just reset the source
             if noise is not None:
                 noise.reset()
         if self._offline:

@@ -95,7 +95,7 @@ def _train_in_source(model: TransferAlgorithm, source_timesteps: int, progress_b
         from tqdm.rich import tqdm
 
         bar = tqdm(total=source_timesteps, initial=model._pretrained_steps, desc="source")
-    source = EpisodeSource(model.env)
+    source = EpisodeSource(model.env, model._source_first_obs)
     model._pretraining = True
     report_every = max(source_timesteps // 10, 1)
     next_report = (model._pretrained_steps // report_every + 1) * report_every

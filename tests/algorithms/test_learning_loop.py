@@ -312,7 +312,9 @@ def test_nan_from_an_environment_names_the_world(world):
 
 
 def test_offline_data_stand_in_for_the_target(tmp_path):
-    recorder = SAC("MlpPolicy", pendulum(12.0), policy_kwargs={"net_arch": [16]}, learning_starts=300, seed=0).learn(300)
+    recorder = SAC("MlpPolicy", pendulum(12.0), policy_kwargs={"net_arch": [16]}, learning_starts=300, seed=0).learn(
+        300
+    )
     model = RPTO(
         "MlpPolicy",
         pendulum(),

@@ -15,7 +15,14 @@ from sb3_rpto.algorithms.update import ALTERNATION
 
 def filled_sac(**kwargs) -> SAC:
     sac = SAC(
-        "MlpPolicy", pendulum(), policy_kwargs={"net_arch": [16]}, batch_size=32, learning_starts=40, seed=0, device="cpu", **kwargs
+        "MlpPolicy",
+        pendulum(),
+        policy_kwargs={"net_arch": [16]},
+        batch_size=32,
+        learning_starts=40,
+        seed=0,
+        device="cpu",
+        **kwargs,
     )
     return sac.learn(60)
 
@@ -55,7 +62,9 @@ def test_given_the_same_minibatches_the_update_is_sacs(kwargs, monkeypatch):
         algorithm.train(gradient_steps=25, batch_size=32)
     for name, ours in model.policy.state_dict().items():
         assert th.equal(ours, sac.policy.state_dict()[name]), name
-    assert th.equal(model.temperature(), sac.log_ent_coef.exp() if sac.log_ent_coef is not None else sac.ent_coef_tensor)
+    assert th.equal(
+        model.temperature(), sac.log_ent_coef.exp() if sac.log_ent_coef is not None else sac.ent_coef_tensor
+    )
     for name in ("train/actor_loss", "train/critic_loss", "train/learning_rate"):
         assert model.logger.name_to_value[name] == pytest.approx(sac.logger.name_to_value[name], rel=1e-6), name
 

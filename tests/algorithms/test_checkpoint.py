@@ -1,0 +1,282 @@
+"""A checkpoint is complete: resuming equals not having stopped."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import ALGORITHMS, SMALL_POLICY, pendulum, small
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+
+from sb3_rpto import RPO, RPTO, RTO
+from sb3_rpto.buffers import chronological
+
+
+def assert_same(a, b):
+    for name, value in a.get_parameters().items():
+        flat_a, flat_b = _leaves(value), _leaves(b.get_parameters()[name])
+        assert len(flat_a) == len(flat_b)
+        for x, y in zip(flat_a, flat_b):
+            assert x == y if not th.is_tensor(x) else th.equal(x, y), name
+    for world in ("source", "target"):
+        ours, theirs = (chronological(model.replay_buffer.side(world)) for model in (a, b))
+        for name in ours:
+            np.testing.assert_array_equal(ours[name], theirs[name], err_msg=f"{world} {name}")
+    for counter in ("num_timesteps", "source_timesteps", "_n_updates", "_actor_updates", "_since_fit", "_episode_num"):
+        assert getattr(a, counter) == getattr(b, counter), counter
+    assert a.temperature() == b.temperature()
+
+
+def _leaves(tree):
+    if isinstance(tree, dict):
+        return [leaf for key in sorted(tree, key=str) for leaf in _leaves(tree[key])]
+    if isinstance(tree, list | tuple):
+        return [leaf for item in tree for leaf in _leaves(item)]
+    return [tree]
+
+
+def cartpole(**constants):
+    return gym.make("rpto/ContinuousCartPole-v0", **constants)
+
+
+def double_pendulum():
+    return gym.make("InvertedDoublePendulum-v5")
+
+
+def hopper(gravity: float = -9.81):
+    env = gym.make("Hopper-v5")
+    env.unwrapped.model.opt.gravity[2] = gravity
+    return env
+
+
+CASES = {
+    "rpo-pendulum": (RPO, pendulum, lambda: pendulum(12.0), {}),
+    "rto-pendulum": (RTO, pendulum, lambda: pendulum(12.0), {}),
+    "rpto-pendulum": (RPTO, pendulum, lambda: pendulum(12.0), {}),
+    "rpo-mujoco": (RPO, hopper, lambda: hopper(-12.0), {}),
+    "rpto-physical": (RPTO, cartpole, lambda: cartpole(pole_length=2.0), {"dynamics": "physical"}),
+    "rpto-gsde": (RPTO, pendulum, lambda: pendulum(12.0), {"use_sde": True}),
+    "rpo-normalised": (
+        RPO,
+        lambda: VecNormalize(make_vec_env(pendulum, n_envs=2, seed=3)),
+        lambda: make_vec_env(lambda: pendulum(12.0), n_envs=2, seed=4),
+        {},
+    ),
+    "physical-normalised": (
+        RPTO,
+        lambda: VecNormalize(make_vec_env(cartpole, n_envs=2, seed=3)),
+        lambda: cartpole(pole_length=2.0),
+        {"dynamics": "physical"},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_resuming_equals_not_having_stopped(case, tmp_path):
+    cls, source, target, kwargs = CASES[case]
+
+    def fresh():
+        return small(cls, source(), target(), **kwargs).learn(70, source_timesteps=40)
+
+    unbroken = fresh()
+    unbroken.learn(60, reset_num_timesteps=False)
+
+    stopped = fresh()
+    stopped.save(tmp_path / "model")
+    stopped.save_replay_buffer(tmp_path / "buffer")
+    if isinstance(stopped.env, VecNormalize):
+        stopped.env.save(tmp_path / "statistics.pkl")
+    del stopped
+    env = source()
+    if isinstance(env, VecNormalize):
+        env = VecNormalize.load(tmp_path / "statistics.pkl", env.venv)
+    resumed = cls.load(tmp_path / "model", env=env, target_env=target(), device="cpu")
+    resumed.load_replay_buffer(tmp_path / "buffer")
+    resumed.learn(60, reset_num_timesteps=False)
+    assert resumed.num_timesteps in (130, 130 - 130 % 2)
+    assert_same(unbroken, resumed)
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_a_checkpoint_alone_can_predict(cls, tmp_path):
+    model = small(cls).learn(60, source_timesteps=0)
+    model.save(tmp_path / "model.zip")
+    loaded = cls.load(tmp_path / "model.zip")
+    observations = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+    np.testing.assert_array_equal(
+        model.predict(observations, deterministic=True)[0], loaded.predict(observations, deterministic=True)[0]
+    )
+    assert loaded.target_env is None
+    with pytest.raises(ValueError, match="env="):
+        loaded.learn(10)
+    loaded.set_env(pendulum())
+    with pytest.raises(ValueError, match="target"):
+        loaded.learn(10)
+    loaded.set_target_env(pendulum(12.0))
+    loaded.learn(10, source_timesteps=0)
+
+
+def test_the_dynamics_come_back_whole(tmp_path):
+    model = small(RPTO).learn(120, source_timesteps=0)
+    model.save(tmp_path / "model.zip")
+    loaded = RPTO.load(tmp_path / "model.zip")
+    before, after = model.dynamics.state_dict(), loaded.dynamics.state_dict()
+    assert before.keys() == after.keys()
+    for name in before:
+        if th.is_tensor(before[name]):
+            assert th.equal(before[name], after[name]), name
+    assert loaded.dynamics.fitted
+    assert any("std" in name for name in before)
+
+
+def test_the_corrected_simulator_comes_back(tmp_path):
+    model = small(RPTO, cartpole(), cartpole(pole_length=1.3), dynamics="physical", declared=["pole_length", "gravity"])
+    model.learn(200, source_timesteps=50)
+    assert model.dynamics.describe()["pole_length"] > 1.02
+    model.save(tmp_path / "model.zip")
+    assert RPTO.load(tmp_path / "model.zip").dynamics.constants == model.dynamics.constants
+
+
+def test_an_untrained_model_is_still_untrained_after_loading(tmp_path):
+    model = small(RPO)
+    model.save(tmp_path / "fresh.zip")
+    loaded = RPO.load(tmp_path / "fresh.zip", env=pendulum(), target_env=pendulum(12.0))
+    loaded.learn(5, source_timesteps=60)
+    assert loaded._pretrained_steps == 60
+
+
+def test_a_killed_source_phase_goes_on_from_its_checkpoint(tmp_path):
+    from stable_baselines3.common.logger import configure
+
+    class Killed(gym.Wrapper):
+        steps = 0
+
+        def step(self, action):
+            self.steps += 1
+            if self.steps == 200:
+                raise KeyboardInterrupt
+            return super().step(action)
+
+    model = small(RPO, Killed(pendulum()))
+    model.set_logger(configure(str(tmp_path), []))
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(5, source_timesteps=300)
+    resumed = RPO.load(tmp_path / "pretrain.zip", env=pendulum(), target_env=pendulum(12.0))
+    resumed.load_replay_buffer(tmp_path / "pretrain_replay_buffer.pkl")
+    done = resumed._pretrained_steps
+    assert 0 < done < 300
+    assert resumed.replay_buffer.source.size() == done
+    resumed.learn(5, source_timesteps=300)
+    assert resumed._pretrained_steps == 300
+
+
+def test_a_world_that_cannot_restore_its_state_says_so(tmp_path):
+    target = SubprocVecEnv([lambda: pendulum(12.0)])
+    try:
+        model = small(RPO, target=target).learn(30, source_timesteps=0)
+        model.save(tmp_path / "model.zip")
+        resumed = RPO.load(tmp_path / "model.zip", env=pendulum(), target_env=target)
+        with pytest.warns(UserWarning, match="target environment cannot restore"):
+            resumed.learn(10, reset_num_timesteps=False)
+        assert resumed.num_timesteps == 40
+    finally:
+        target.close()
+
+
+def test_files_are_written_whole_or_not_at_all(tmp_path):
+    model = small(RPO).learn(10, source_timesteps=0)
+    path = tmp_path / "model.zip"
+    model.save(path)
+    content = path.read_bytes()
+    model.snapshots["unpicklable"] = {"policy": (i for i in range(3)), "temperature": 1.0}
+    model.get_parameters = None  # type: ignore[method-assign]
+    with pytest.raises(TypeError):
+        model.save(path)
+    assert path.read_bytes() == content
+    assert [file.name for file in tmp_path.iterdir()] == ["model.zip"]
+
+
+# ---------------------------------------------------------------------- warm start
+
+
+def test_from_source_takes_everything_over(tmp_path):
+    sac = SAC(
+        "MlpPolicy", pendulum(), policy_kwargs=SMALL_POLICY, gamma=0.9, tau=0.02, learning_starts=20, seed=0
+    ).learn(80)
+    sac.save(tmp_path / "sac.zip")
+    for origin in (sac, str(tmp_path / "sac.zip")):
+        model = RPTO.from_source(origin, pendulum(), target_env=pendulum(12.0), gamma=0.8)
+        for name, value in sac.policy.state_dict().items():
+            assert th.equal(model.policy.state_dict()[name], value)
+        assert model.temperature() == sac.log_ent_coef.exp()
+        assert (model.gamma, model.tau) == (0.8, 0.02)
+        ours, theirs = model.actor.optimizer.state_dict()["state"], sac.actor.optimizer.state_dict()["state"]
+        assert all(th.equal(ours[i]["exp_avg"], theirs[i]["exp_avg"]) for i in theirs)
+    model.learn(3)
+    assert model._pretrained_steps == 0
+
+
+@pytest.mark.parametrize("form", ["npz", "buffer", "pickle"])
+def test_source_data_fit_phi_0_and_spare_the_source(form, tmp_path):
+    sac = SAC("MlpPolicy", pendulum(), policy_kwargs=SMALL_POLICY, learning_starts=200, seed=0).learn(200)
+    data = sac.replay_buffer
+    if form == "pickle":
+        sac.save_replay_buffer(tmp_path / "data.pkl")
+        data = tmp_path / "data.pkl"
+    if form == "npz":
+        arrays = chronological(sac.replay_buffer)
+        names = {
+            "obs": "observations",
+            "act": "actions",
+            "next_obs": "next_observations",
+            "rew": "rewards",
+            "done": "terminations",
+        }
+        np.savez(tmp_path / "data.npz", **{key: arrays[name] for key, name in names.items()})
+        data = tmp_path / "data.npz"
+    model = small_from(sac, source_data=data)
+    assert model.replay_buffer.source.size() == 200
+    model.learn(5)
+    assert model.dynamics.fitted
+    assert model.source_timesteps == 5 * 8
+
+
+def small_from(sac, **kwargs):
+    from conftest import SMALL_ENSEMBLE
+
+    settings = {"dynamics_kwargs": SMALL_ENSEMBLE, "source_steps": 8, "device": "cpu"}
+    return RPTO.from_source(sac, pendulum(), pendulum(12.0), **settings, **kwargs)
+
+
+def test_a_source_model_that_does_not_fit_is_refused():
+    other = SAC("MlpPolicy", gym.make("MountainCarContinuous-v0"), policy_kwargs=SMALL_POLICY)
+    with pytest.raises(ValueError, match="source_model has observation_space"):
+        RPTO.from_source(other, pendulum(), pendulum(12.0))
+    sac = SAC("MlpPolicy", pendulum(), policy_kwargs=SMALL_POLICY)
+    with pytest.raises(ValueError, match="policy_kwargs"):
+        RPTO.from_source(sac, pendulum(), pendulum(12.0), policy_kwargs={"net_arch": [32]})
+    short = SAC(
+        "MlpPolicy", gym.make("MountainCarContinuous-v0"), policy_kwargs=SMALL_POLICY, learning_starts=20
+    ).learn(20)
+    with pytest.raises(ValueError, match="source_data holds observations"):
+        RPTO.from_source(sac, pendulum(), pendulum(12.0), source_data=short.replay_buffer)
+
+
+def test_parameters_set_by_hand_count_as_a_warm_start():
+    sac = SAC("MlpPolicy", pendulum(), policy_kwargs=SMALL_POLICY)
+    model = small(RPO)
+    model.set_parameters(sac.get_parameters())
+    model.learn(3)
+    assert model._pretrained_steps == 0
+
+
+def test_action_noise_belongs_to_the_target():
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), 0.1 * np.ones(1))
+    model = small(RPO, make_vec_env(pendulum, n_envs=3), action_noise=noise)
+    model.learn(20, source_timesteps=0)
+    assert model.action_noise is noise
+    model = small(RPO, target=make_vec_env(lambda: pendulum(12.0), n_envs=2), action_noise=noise)
+    model.learn(20, source_timesteps=0)
+    assert model.action_noise.n_envs == 2
