@@ -80,7 +80,7 @@ class DualReplayBuffer(ReplayBuffer):
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @property
-    def pos(self) -> int:  # type: ignore[override]
+    def pos(self) -> int:
         """Write position of the target side."""
         return self.target.pos
 
@@ -89,7 +89,7 @@ class DualReplayBuffer(ReplayBuffer):
         self.target.pos = value
 
     @property
-    def full(self) -> bool:  # type: ignore[override]
+    def full(self) -> bool:
         """Whether the target side has wrapped around."""
         return self.target.full
 
@@ -98,7 +98,7 @@ class DualReplayBuffer(ReplayBuffer):
         self.target.full = value
 
     @property
-    def device(self) -> th.device:  # type: ignore[override]
+    def device(self) -> th.device:
         """Device of the sampled tensors; setting it moves no memory."""
         return self.target.device
 
@@ -171,9 +171,7 @@ class DualReplayBuffer(ReplayBuffer):
         side.full = side.full or side.pos + n >= side.buffer_size
         side.pos = (side.pos + n) % side.buffer_size
 
-    def sample(  # type: ignore[override]
-        self, batch_size: int, env: VecNormalize | None = None, world: World = "target"
-    ) -> ReplayBufferSamples:
+    def sample(self, batch_size: int, env: VecNormalize | None = None, world: World = "target") -> ReplayBufferSamples:
         """Draw transitions uniformly from one world; as SB3's ``ReplayBuffer.sample`` on that side."""
         side = self.side(world)
         if side.size() == 0:

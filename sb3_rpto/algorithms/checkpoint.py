@@ -8,7 +8,7 @@ import pathlib
 import random
 import warnings
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 import torch as th
@@ -37,7 +37,7 @@ class Resumable(PolicySnapshots):
         include: Iterable[str] | None = None,
     ) -> None:
         """Save all that a resumed run needs, except the replay buffers (``save_replay_buffer``); atomic for paths."""
-        self._resume_state = self._resume_state or capture(self)
+        self._resume_state = self._resume_state or capture(_whole(self))
         try:
             write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
         finally:
@@ -48,7 +48,7 @@ class Resumable(PolicySnapshots):
         write_atomically(path, super().save_replay_buffer, suffix="pkl")
 
     @classmethod
-    def load(  # type: ignore[override]
+    def load(
         cls: type[Self],
         path: str | pathlib.Path | io.BufferedIOBase,
         env: GymEnv | None = None,
@@ -65,9 +65,10 @@ class Resumable(PolicySnapshots):
         :param kwargs: as SB3's ``load``
         """
         model = super().load(path, env, *args, **kwargs)
+        assert model._resume_state is not None  # every checkpoint holds one
         model._warm = model._resume_state["warm"]
         if target_env is not None:
-            model.set_target_env(target_env)
+            _whole(model).set_target_env(target_env)
         return model
 
     def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto") -> None:
@@ -97,6 +98,10 @@ class Resumable(PolicySnapshots):
         return state_dicts, variables
 
 
+def _whole(model: Resumable) -> TransferAlgorithm:
+    return cast("TransferAlgorithm", model)  # the one class that is built on Resumable
+
+
 def capture(model: TransferAlgorithm) -> dict[str, Any]:
     """Where the two worlds and the random streams stand, as plain data."""
     return {
@@ -121,6 +126,7 @@ def resume(model: TransferAlgorithm) -> None:
     state, model._resume_state = model._resume_state, None
     if state is None:
         return
+    assert model.env is not None  # learn() has checked both worlds
     restarted = []
     if state["source"] is None:
         restarted.append("source")
@@ -132,6 +138,7 @@ def resume(model: TransferAlgorithm) -> None:
         if state["target"] is None or state["last_obs"] is None:
             restarted.append("target")
         else:
+            assert model.target_env is not None
             restore_state(find_ledger(model.target_env).venv, state["target"])
             model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
             if state["null_check_done"]:

@@ -45,8 +45,9 @@ class EpisodeSource:
         """
         normaliser = unwrap_vec_normalize(self.env)
         if self._last_obs is None:
-            self._last_obs = self.env.reset()  # type: ignore[assignment]
+            self._last_obs = np.asarray(self.env.reset())
             self._last_raw = self._raw(self._last_obs)
+        assert self._last_raw is not None  # it comes and goes with _last_obs
         model.policy.set_training_mode(False)
         steps = 0
         while steps < n_steps:
@@ -55,8 +56,8 @@ class EpisodeSource:
             else:
                 actions, _ = model.policy.predict(self._last_obs, deterministic=False)
             new_obs, rewards, dones, infos = self.env.step(actions)
-            raw_obs, self._last_raw = self._last_raw, self._raw(new_obs)
-            raw_next = self._last_raw.copy()
+            raw_obs, raw_next = self._last_raw, self._raw(new_obs)
+            self._last_raw = raw_next.copy()
             if normaliser is not None:
                 rewards = normaliser.get_original_reward()
             for i in np.flatnonzero(dones):
@@ -70,7 +71,7 @@ class EpisodeSource:
                 if "episode" in info:
                     self.returns.append(info["episode"]["r"])
                     self.lengths.append(info["episode"]["l"])
-            self._last_obs = new_obs  # type: ignore[assignment]
+            self._last_obs = np.asarray(new_obs)
             steps += self.env.num_envs
         return steps
 

@@ -81,6 +81,10 @@ class TransferAlgorithm(Resumable):
     :raises NotImplementedError: for Dict, image or discrete spaces, n-step returns and HER
     """
 
+    _passed: frozenset[str]
+    _last_obs: np.ndarray | None  # observations are flat Boxes, never a Dict
+    _last_original_obs: np.ndarray | None
+
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         """Remember which arguments the user passed: a preset fills in only the others."""
         self = super().__new__(cls)
@@ -204,7 +208,7 @@ class TransferAlgorithm(Resumable):
         if _init_setup_model:
             self._apply_preset()
             self._check_arguments(close_loop)
-            if env is not None and self.updates_dynamics:
+            if self.env is not None and self.updates_dynamics:
                 self.dynamics_config = dynamics_config(
                     self.dynamics_backend, self.env, self.dynamics_kwargs, self.declared
                 )
@@ -313,7 +317,7 @@ class TransferAlgorithm(Resumable):
         super().set_env(env, force_reset)
         self._last_obs = last_obs  # SB3 forgets the observation of what it takes to be the training env
         self._source_world = None
-        if self.target_env is not None:
+        if self.env is not None and self.target_env is not None:
             check_pair(self.env, find_ledger(self.target_env))
             self.target_env = share_normalisation(find_ledger(self.target_env), self.env)
 
@@ -351,7 +355,7 @@ class TransferAlgorithm(Resumable):
 
     # ------------------------------------------------------------------ Algorithm 1
 
-    def learn(  # type: ignore[override]
+    def learn(
         self: Self,
         total_timesteps: int = 10_000,
         callback: MaybeCallback = None,
@@ -504,14 +508,15 @@ class TransferAlgorithm(Resumable):
         if self._offline:
             self._last_obs = np.zeros((1, *self.observation_space.shape), self.observation_space.dtype)  # never read
         elif starts_episode:
+            assert self.env is not None  # _check_ready has seen both
             assert self.target_env is not None
             n_envs = self.target_env.num_envs
             if noise is not None and n_envs > 1 and not isinstance(noise, VectorizedActionNoise):
                 self.action_noise = VectorizedActionNoise(noise, n_envs)
-            self._last_obs = self.target_env.reset()  # type: ignore[assignment]
+            self._last_obs = np.asarray(self.target_env.reset())
             self._last_episode_starts = np.ones(n_envs, dtype=bool)
             normaliser = unwrap_vec_normalize(self.target_env)
-            self._last_original_obs = None if normaliser is None else normaliser.get_original_obs()
+            self._last_original_obs = None if normaliser is None else np.asarray(normaliser.get_original_obs())
             check_finite("target", observation=self._last_obs)
             if self.num_timesteps == 0:
                 self._null_check = NullShiftCheck(self.env, find_ledger(self.target_env).venv)
@@ -527,17 +532,17 @@ class TransferAlgorithm(Resumable):
         infos: list[dict[str, Any]],
     ) -> None:
         """Store a target transition as SB3 does, after a look at it."""
-        check_finite("target", observation=new_obs, reward=reward)
+        check_finite("target", observation=np.asarray(new_obs), reward=reward)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         if self._null_check is not None:
-            last = (replay_buffer.pos - len(dones)) % replay_buffer.target.buffer_size
-            answer = replay_buffer.target.next_observations[last, 0]
+            side = self.replay_buffer.target
+            answer = side.next_observations[(side.pos - len(dones)) % side.buffer_size, 0]
             if self._null_check.agrees(self.policy.unscale_action(buffer_action[:1]), answer, bool(dones[0])):
                 warnings.warn(
                     "target_env has stepped exactly like env so far: is it the world you meant? (Nothing to transfer.)",
                     stacklevel=2,
                 )
-        if self.updates_policy and any("episode" in info for info in infos):
+        if self.updates_policy and self.ep_info_buffer is not None and any("episode" in info for info in infos):
             recent = [info["r"] for info in list(self.ep_info_buffer)[-RECENT_EPISODES:]]
             if len(recent) == RECENT_EPISODES:
                 self.keep_if_best(float(np.mean(recent)))

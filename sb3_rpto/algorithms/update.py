@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.utils import polyak_update
@@ -28,7 +29,10 @@ class RelativeUpdate(SAC):
     updates_policy: ClassVar[bool]
     updates_dynamics: ClassVar[bool]
 
-    replay_buffer: DualReplayBuffer  # type: ignore[assignment]
+    observation_space: spaces.Box  # check_spaces refuses any other
+    action_space: spaces.Box
+    replay_buffer: DualReplayBuffer
+    target_entropy: float  # SAC's setup has replaced "auto"
     dynamics: Dynamics | None
     weighting: WeightingName | None
     weight_floor: float
@@ -155,6 +159,7 @@ class RelativeUpdate(SAC):
 
     def temperature_loss(self, log_prob: th.Tensor) -> th.Tensor:
         """SAC's loss of log alpha on the batch that the actor sees."""
+        assert self.log_ent_coef is not None  # it is learned
         return -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
 
     def soft_value(self, observations: th.Tensor) -> th.Tensor:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import copy
 import pathlib
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.buffers import World, load_transitions
@@ -39,7 +40,7 @@ def from_source(
     sac = source_model if isinstance(source_model, SAC) else SAC.load(source_model, device=kwargs.get("device", "auto"))
     carried = {name: getattr(sac, name) for name in CARRIED}
     carried["policy_kwargs"] = {name: value for name, value in sac.policy_kwargs.items() if name != "use_sde"}
-    model = cls(sac.policy_class, env, target_env=target_env, **{**carried, **kwargs})
+    model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **{**carried, **kwargs})
     for name in ("observation_space", "action_space"):
         ours, theirs = getattr(model, name), getattr(sac, name)
         if ours.shape != theirs.shape:
@@ -74,22 +75,24 @@ def begin_in_source(model: TransferAlgorithm, source_timesteps: int, progress_ba
     model._warm = True
     if not model.snapshots:
         model.take_snapshot("source")
-    learns_network = model.updates_dynamics and model.dynamics.rollout == "branches"
-    if len(model.replay_buffer.source_starts) == 0 and (learns_network or model.replay_buffer.source.size() == 0):
-        needed = PHI_0_STEPS if learns_network else FIRST_SOURCE_STEPS
+    assert model.env is not None  # learn() has checked
+    network = model.dynamics if model.dynamics is not None and model.dynamics.rollout == "branches" else None
+    if len(model.replay_buffer.source_starts) == 0 and (network is not None or model.replay_buffer.source.size() == 0):
+        needed = PHI_0_STEPS if network is not None else FIRST_SOURCE_STEPS
         real = EpisodeSource(model.env)
         model.source_timesteps += real.interact(model, min(needed, model.replay_buffer.source.buffer_size))
         model.env.reset()
-    if learns_network:
+    if network is not None:
         if len(model.replay_buffer.source_starts) == 0:
             model.replay_buffer.source_starts = model.transitions("source").observations.cpu().numpy()[-PHI_0_STEPS:]
-        if not model.dynamics.fitted:
-            for name, value in model.dynamics.fit(model.transitions("source"), max_steps=PHI_0_UPDATES).items():
+        if not network.fitted:
+            for name, value in network.fit(model.transitions("source"), max_steps=PHI_0_UPDATES).items():
                 model.logger.record(f"dynamics/phi_0_{name}", value)
 
 
 def _train_in_source(model: TransferAlgorithm, source_timesteps: int, progress_bar: bool) -> None:
     """Plain SAC in the real source, one update per step; resumes where a checkpoint left it."""
+    assert model.env is not None  # learn() has checked
     bar = None
     if progress_bar:
         from tqdm.rich import tqdm
@@ -131,7 +134,10 @@ def _report(model: TransferAlgorithm, source: EpisodeSource) -> None:
 
 def _carry_optimizers(sac: SAC, model: TransferAlgorithm) -> None:
     """Take over the temperature and the state of every optimiser."""
-    pairs = [(sac.actor.optimizer, model.actor.optimizer), (sac.critic.optimizer, model.critic.optimizer)]
+    pairs: list[tuple[Any, Any]] = [
+        (sac.actor.optimizer, model.actor.optimizer),
+        (sac.critic.optimizer, model.critic.optimizer),
+    ]
     if sac.log_ent_coef is not None and model.log_ent_coef is not None:
         model.log_ent_coef.data.copy_(sac.log_ent_coef.data)
         pairs.append((sac.ent_coef_optimizer, model.ent_coef_optimizer))

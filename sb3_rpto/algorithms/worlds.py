@@ -195,8 +195,8 @@ class NullShiftCheck:
         """
         if self._copy is None:
             return None
-        answer, _, copy_done, infos = self._copy.step(actions)
-        answer = infos[0].get("terminal_observation", answer[0])
+        observations, _, copy_done, infos = self._copy.step(actions)
+        answer = infos[0].get("terminal_observation", np.asarray(observations)[0])
         if not np.allclose(answer, next_observation, rtol=1e-9, atol=1e-9) or bool(copy_done[0]) != done:
             self._copy = None
             return None
