@@ -15,6 +15,8 @@ class PolicySnapshots(RelativeUpdate):
     #: by name: "source" (as it came) and "best" (highest return in the target)
     snapshots: dict[str, dict[str, Any]]
     best_mean_reward: float
+    #: what ``best_mean_reward`` is: the mean of recent training episodes, or an evaluation (``callbacks.KeepBest``)
+    best_by: Literal["training", "evaluation"] = "training"
 
     def keep_if_best(self, mean_reward: float) -> bool:
         """Keep the current policy as "best" if it earned more than any before.

@@ -542,7 +542,8 @@ class TransferAlgorithm(Resumable):
                     "target_env has stepped exactly like env so far: is it the world you meant? (Nothing to transfer.)",
                     stacklevel=2,
                 )
-        if self.updates_policy and self.ep_info_buffer is not None and any("episode" in info for info in infos):
+        judged = self.updates_policy and self.best_by == "training" and any("episode" in info for info in infos)
+        if judged and self.ep_info_buffer is not None:
             recent = [info["r"] for info in list(self.ep_info_buffer)[-RECENT_EPISODES:]]
             if len(recent) == RECENT_EPISODES:
                 self.keep_if_best(float(np.mean(recent)))
@@ -564,7 +565,10 @@ class TransferAlgorithm(Resumable):
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         """As SB3's, with a bar that advances by the target's environments, not the source's."""
+        judged_by, self.best_by = self.best_by, "training"
         callbacks = super()._init_callback(callback, progress_bar)
+        if self.best_by != judged_by:  # by a callback, or no longer: the two measures cannot be compared
+            self.best_mean_reward = -np.inf
         for item in _flatten(callbacks):
             if isinstance(item, ProgressBarCallback):
                 item.__class__ = TargetProgressBar
