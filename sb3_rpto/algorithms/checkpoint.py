@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_rpto.algorithms.snapshots import PolicySnapshots
 from sb3_rpto.algorithms.worlds import find_ledger
+from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.envs.state import restore_state, save_state
 
 if TYPE_CHECKING:
@@ -37,6 +39,9 @@ class Resumable(PolicySnapshots):
         include: Iterable[str] | None = None,
     ) -> None:
         """Save all that a resumed run needs, except the replay buffers (``save_replay_buffer``); atomic for paths."""
+        target_env = _whole(self).target_env
+        if target_env is not None:  # a callback may save in the middle of a rollout
+            _whole(self).target_spent = dict(find_ledger(target_env).spent)
         self._resume_state = self._resume_state or capture(_whole(self))
         try:
             write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
@@ -46,6 +51,21 @@ class Resumable(PolicySnapshots):
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Save both replay buffers as one pickle; atomic for paths."""
         write_atomically(path, super().save_replay_buffer, suffix="pkl")
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """Load both replay buffers.
+
+        :param path: what ``save_replay_buffer`` wrote
+        :param truncate_last_traj: as in SB3; without effect here
+        :raises ValueError: for the buffer of another algorithm; the model keeps its own then
+        """
+        kept = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        if not isinstance(self.replay_buffer, DualReplayBuffer):
+            self.replay_buffer = kept
+            raise ValueError(
+                f"{path} holds one world only; pass it as source_data= of from_source() or as target_data="
+            )
 
     @classmethod
     def load(
@@ -63,9 +83,17 @@ class Resumable(PolicySnapshots):
         :param args: as SB3's ``load``
         :param target_env: the target
         :param kwargs: as SB3's ``load``
+        :raises ValueError: for a file that another algorithm saved
         """
         model = super().load(path, env, *args, **kwargs)
-        assert model._resume_state is not None  # every checkpoint holds one
+        if model._resume_state is None:
+            raise ValueError(
+                f"{path} was not saved by {cls.__name__}; start from a SAC model by "
+                f"{cls.__name__}.from_source(path, env, target_env=...)"
+            )
+        if (model.dynamics is not None) != cls.updates_dynamics:
+            saved_by = "RPO" if model.dynamics is None else "RTO or RPTO"
+            raise ValueError(f"{path} was saved by {saved_by}, {cls.__name__} cannot continue it; load it there")
         model._warm = model._resume_state["warm"]
         if target_env is not None:
             _whole(model).set_target_env(target_env)
@@ -104,6 +132,7 @@ def _whole(model: Resumable) -> TransferAlgorithm:
 
 def capture(model: TransferAlgorithm) -> dict[str, Any]:
     """Where the two worlds and the random streams stand, as plain data."""
+    last_obs, last_original_obs = _target_observation(model)
     return {
         "random": random.getstate(),
         "numpy": np.random.get_state(),
@@ -111,11 +140,25 @@ def capture(model: TransferAlgorithm) -> dict[str, Any]:
         "source": None if model.env is None else save_state(model.env),
         "target": None if model.target_env is None else save_state(find_ledger(model.target_env).venv),
         "source_world": None if model._source_world is None else model._source_world.get_state(),
-        "last_obs": model._last_obs,
-        "last_original_obs": model._last_original_obs,
+        "last_obs": last_obs,
+        "last_original_obs": last_original_obs,
         "null_check_done": model._null_check is None,
         "warm": model._warm,
     }
+
+
+def _target_observation(model: TransferAlgorithm) -> tuple[Any, Any]:
+    """Where the target stands, as the policy sees it and raw.
+
+    SB3 calls callbacks between a step and its storing. ``_last_obs`` is then one step behind the environment, which
+    would be paired with the wrong successor after resuming; as in SB3, the step itself is not in the saved buffer.
+    """
+    ahead = None if model.target_env is None else find_ledger(model.target_env).unstored
+    if ahead is None:
+        return model._last_obs, model._last_original_obs
+    assert model.target_env is not None
+    normaliser = unwrap_vec_normalize(model.target_env)
+    return ahead if normaliser is None else normaliser.normalize_obs(ahead), ahead
 
 
 def resume(model: TransferAlgorithm) -> None:

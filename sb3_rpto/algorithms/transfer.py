@@ -13,7 +13,12 @@ import numpy as np
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    ProgressBarCallback,
+    StopTrainingOnMaxEpisodes,
+)
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.type_aliases import (
     GymEnv,
@@ -22,7 +27,7 @@ from stable_baselines3.common.type_aliases import (
     TrainFreq,
     TrainFrequencyUnit,
 )
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_rpto.algorithms import checkpoint, warm
@@ -321,6 +326,10 @@ class TransferAlgorithm(Resumable):
             check_pair(self.env, find_ledger(self.target_env))
             self.target_env = share_normalisation(find_ledger(self.target_env), self.env)
 
+    def get_vec_normalize_env(self) -> VecNormalize | None:
+        """The source's VecNormalize, which learns the statistics, also while SB3 collects in the target."""
+        return None if self.env is None else unwrap_vec_normalize(self.env)
+
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed both worlds and the model, each with its own stream; with None nothing is seeded."""
         super().set_random_seed(seed)
@@ -394,7 +403,8 @@ class TransferAlgorithm(Resumable):
             self.interact_with_source()
             if not self.interact_with_target(callback, log_interval):
                 break
-            self.train(self._collected * abs(self.gradient_steps), self.batch_size)
+            updates = self.gradient_steps if self.gradient_steps >= 0 else 1  # SB3: negative means one a step
+            self.train(self._collected * updates, self.batch_size)
             self.fit_dynamics()
         callback.on_training_end()
         return self
@@ -433,6 +443,8 @@ class TransferAlgorithm(Resumable):
                         action_noise=self.action_noise,
                         log_interval=log_interval,
                     )
+                if not rollout.continue_training:
+                    self._store_last_step(callback)
                 taken, episodes = taken + rollout.episode_timesteps, episodes + rollout.n_episodes
                 finished = not whole_episodes or episodes >= self.train_freq.frequency or self._steps_left() == 0
                 if finished or not rollout.continue_training:
@@ -534,6 +546,8 @@ class TransferAlgorithm(Resumable):
         """Store a target transition as SB3 does, after a look at it."""
         check_finite("target", observation=np.asarray(new_obs), reward=reward)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        assert self.target_env is not None
+        find_ledger(self.target_env).unstored = None
         if self._null_check is not None:
             side = self.replay_buffer.target
             answer = side.next_observations[(side.pos - len(dones)) % side.buffer_size, 0]
@@ -547,6 +561,14 @@ class TransferAlgorithm(Resumable):
             recent = [info["r"] for info in list(self.ep_info_buffer)[-RECENT_EPISODES:]]
             if len(recent) == RECENT_EPISODES:
                 self.keep_if_best(float(np.mean(recent)))
+
+    def _store_last_step(self, callback: BaseCallback) -> None:
+        """Keep the target step after which a callback stopped: SB3 drops it, and ``_last_obs`` would stay behind."""
+        step = callback.locals
+        self._update_info_buffer(step["infos"], step["dones"])
+        self._episode_num += int(step["dones"].sum())
+        names = ("buffer_actions", "new_obs", "rewards", "dones", "infos")
+        self._store_transition(self.replay_buffer, *(step[name] for name in names))
 
     def _count_source_steps(self, callback: BaseCallback) -> bool:
         """What stands in for a target step when the target is a log: ``num_timesteps`` counts source steps."""
@@ -564,7 +586,7 @@ class TransferAlgorithm(Resumable):
         super().dump_logs()
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        """As SB3's, with a bar that advances by the target's environments, not the source's."""
+        """As SB3's, with what counts environments counting the target's, not the source's."""
         judged_by, self.best_by = self.best_by, "training"
         callbacks = super()._init_callback(callback, progress_bar)
         if self.best_by != judged_by:  # by a callback, or no longer: the two measures cannot be compared
@@ -572,6 +594,8 @@ class TransferAlgorithm(Resumable):
         for item in _flatten(callbacks):
             if isinstance(item, ProgressBarCallback):
                 item.__class__ = TargetProgressBar
+            elif isinstance(item, StopTrainingOnMaxEpisodes) and self.target_env is not None:
+                item._total_max_episodes = item.max_episodes * self.target_env.num_envs
         return callbacks
 
 

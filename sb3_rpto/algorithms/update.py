@@ -64,7 +64,7 @@ class RelativeUpdate(SAC):
         for gradient_step in range(gradient_steps):
             critic_batch, actor_batch = self.sample_batches(batch_size)
             step_losses: dict[str, th.Tensor] = {}
-            ent_coef = self.temperature()
+            step_losses["ent_coef"] = ent_coef = self.temperature()
             # The order is SAC's: the actor samples first, its loss then uses the updated critic.
             if self._policy_learns():
                 if self.use_sde:
@@ -86,7 +86,6 @@ class RelativeUpdate(SAC):
                 losses.setdefault(name, []).append(loss.item())
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/ent_coef", self.temperature().item())
         for name, values in losses.items():
             self.logger.record(f"train/{name}", float(np.mean(values)))
 
@@ -97,6 +96,7 @@ class RelativeUpdate(SAC):
             return
         self._since_fit = 0
         assert self.dynamics is not None
+        self.policy.set_training_mode(False)  # values for the weights: no dropout, no new batch statistics
         data = self.transitions("target")
         self.logger.record("dynamics/error_before", self.dynamics.error(data))
         weights = None

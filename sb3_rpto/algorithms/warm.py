@@ -104,7 +104,9 @@ def _train_in_source(model: TransferAlgorithm, source_timesteps: int, progress_b
     next_report = (model._pretrained_steps // report_every + 1) * report_every
     try:
         while model._pretrained_steps < source_timesteps:
-            steps = source.interact(model, 1, random=model._pretrained_steps < model.learning_starts)
+            warming_up = model._pretrained_steps < model.learning_starts
+            explores = model.use_sde and model.use_sde_at_warmup
+            steps = source.interact(model, 1, random=warming_up and not explores)
             model._pretrained_steps += steps
             model.source_timesteps += steps
             if model._pretrained_steps > model.learning_starts:
