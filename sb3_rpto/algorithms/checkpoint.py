@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 Self = TypeVar("Self", bound="Resumable")
 
+#: what SB3's collection knows of a step when it calls back, before it stores the transition
+STEP = ("buffer_actions", "new_obs", "rewards", "dones", "infos")
+
 
 class Resumable(PolicySnapshots):
     """A complete checkpoint: SB3's zip with the dynamics, and where both worlds and the random streams stand."""
@@ -114,6 +117,7 @@ class Resumable(PolicySnapshots):
             "_last_obs",
             "_last_original_obs",
             "_source_first_obs",
+            "_callback",
         ]
         return [*super()._excluded_save_params(), *own]
 
@@ -132,7 +136,6 @@ def _whole(model: Resumable) -> TransferAlgorithm:
 
 def capture(model: TransferAlgorithm) -> dict[str, Any]:
     """Where the two worlds and the random streams stand, as plain data."""
-    last_obs, last_original_obs = _target_observation(model)
     return {
         "random": random.getstate(),
         "numpy": np.random.get_state(),
@@ -140,37 +143,35 @@ def capture(model: TransferAlgorithm) -> dict[str, Any]:
         "source": None if model.env is None else save_state(model.env),
         "target": None if model.target_env is None else save_state(find_ledger(model.target_env).venv),
         "source_world": None if model._source_world is None else model._source_world.get_state(),
-        "last_obs": last_obs,
-        "last_original_obs": last_original_obs,
+        "last_obs": model._last_obs,
+        "last_original_obs": model._last_original_obs,
+        "unstored_step": _unstored_step(model),
         "null_check_done": model._null_check is None,
         "warm": model._warm,
     }
 
 
-def _target_observation(model: TransferAlgorithm) -> tuple[Any, Any]:
-    """Where the target stands, as the policy sees it and raw.
-
-    SB3 calls callbacks between a step and its storing. ``_last_obs`` is then one step behind the environment, which
-    would be paired with the wrong successor after resuming; as in SB3, the step itself is not in the saved buffer.
-    """
-    ahead = None if model.target_env is None else find_ledger(model.target_env).unstored
-    if ahead is None:
-        return model._last_obs, model._last_original_obs
-    assert model.target_env is not None
+def _unstored_step(model: TransferAlgorithm) -> dict[str, Any] | None:
+    """The target step that is taken and not yet stored: SB3 calls callbacks, which may save, between the two."""
+    if model.target_env is None or model._callback is None or not find_ledger(model.target_env).unstored:
+        return None
     normaliser = unwrap_vec_normalize(model.target_env)
-    return ahead if normaliser is None else normaliser.normalize_obs(ahead), ahead
+    raw = None if normaliser is None else {"old_obs": normaliser.old_obs, "old_reward": normaliser.old_reward}
+    return {"raw": raw, "known": {name: model._callback.locals[name] for name in STEP}}
 
 
-def resume(model: TransferAlgorithm) -> None:
+def resume(model: TransferAlgorithm) -> bool:
     """Put the worlds and the random streams back to where the loaded checkpoint left them.
 
     A world that cannot be put back begins a new episode, and a warning says which.
+
+    :return: whether the checkpoint was written between a target step and the update after it
     """
     state, model._resume_state = model._resume_state, None
     if state is None:
-        return
+        return False
     assert model.env is not None  # learn() has checked both worlds
-    restarted = []
+    restarted, inside = [], False
     if state["source"] is None:
         restarted.append("source")
     else:
@@ -186,6 +187,12 @@ def resume(model: TransferAlgorithm) -> None:
             model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
             if state["null_check_done"]:
                 model._null_check = None
+            if state["unstored_step"] is not None:
+                inside = True
+                normaliser = unwrap_vec_normalize(model.target_env)
+                if normaliser is not None:
+                    vars(normaliser).update(state["unstored_step"]["raw"])
+                model.store_step(state["unstored_step"]["known"])
     if restarted:
         warnings.warn(
             f"the {' and the '.join(restarted)} environment cannot restore its state: it begins a new episode, "
@@ -195,6 +202,7 @@ def resume(model: TransferAlgorithm) -> None:
     random.setstate(state["random"])
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
+    return inside
 
 
 def write_atomically(path: Any, write: Callable[[Any], None], suffix: str = "zip") -> None:

@@ -208,6 +208,8 @@ class TransferAlgorithm(Resumable):
         self._source_world: EpisodeSource | BranchSource | None = None
         self._source_first_obs: np.ndarray | None = None
         self._null_check: NullShiftCheck | None = None
+        self._callback: BaseCallback | None = None
+        self._rollout_start = 0
         self._resume_state: dict[str, Any] | None = None
 
         if _init_setup_model:
@@ -397,16 +399,21 @@ class TransferAlgorithm(Resumable):
         )
         self._source_world = self._source_world or self._make_source_world()
         warm.begin_in_source(self, source_timesteps, progress_bar)
-        checkpoint.resume(self)
+        inside_rollout = checkpoint.resume(self)
+        self._callback = callback
         callback.on_training_start(locals(), globals())
-        while self._steps_left() > 0:
-            self.interact_with_source()
-            if not self.interact_with_target(callback, log_interval):
-                break
+        while self._steps_left() > 0 or inside_rollout:
+            if inside_rollout:  # a callback's checkpoint: steps 3 and 4 were done, their update was not
+                inside_rollout, self._collected = False, self.num_timesteps - self._rollout_start
+            else:
+                self.interact_with_source()
+                if not self.interact_with_target(callback, log_interval):
+                    break
             updates = self.gradient_steps if self.gradient_steps >= 0 else 1  # SB3: negative means one a step
             self.train(self._collected * updates, self.batch_size)
             self.fit_dynamics()
         callback.on_training_end()
+        self._callback = None
         return self
 
     def interact_with_source(self) -> None:
@@ -431,6 +438,7 @@ class TransferAlgorithm(Resumable):
         whole_episodes = self.train_freq.unit == TrainFrequencyUnit.EPISODE
         source_normaliser, self._vec_normalize_env = self._vec_normalize_env, unwrap_vec_normalize(self.target_env)
         taken = episodes = 0
+        self._rollout_start = self.num_timesteps
         try:
             while True:
                 steps = 1 if whole_episodes else min(self.train_freq.frequency, self._steps_left() // n_envs)
@@ -444,7 +452,7 @@ class TransferAlgorithm(Resumable):
                         log_interval=log_interval,
                     )
                 if not rollout.continue_training:
-                    self._store_last_step(callback)
+                    self.store_step(callback.locals)  # SB3 drops the step after which a callback stops
                 taken, episodes = taken + rollout.episode_timesteps, episodes + rollout.n_episodes
                 finished = not whole_episodes or episodes >= self.train_freq.frequency or self._steps_left() == 0
                 if finished or not rollout.continue_training:
@@ -515,7 +523,7 @@ class TransferAlgorithm(Resumable):
         self.action_noise = noise
         if starts_episode:
             self._source_world, self._source_first_obs = None, self._last_obs  # SB3 has just reset the source
-            if noise is not None:
+            if noise is not None and self._resume_state is None:
                 noise.reset()
         if self._offline:
             self._last_obs = np.zeros((1, *self.observation_space.shape), self.observation_space.dtype)  # never read
@@ -547,7 +555,7 @@ class TransferAlgorithm(Resumable):
         check_finite("target", observation=np.asarray(new_obs), reward=reward)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         assert self.target_env is not None
-        find_ledger(self.target_env).unstored = None
+        find_ledger(self.target_env).unstored = False
         if self._null_check is not None:
             side = self.replay_buffer.target
             answer = side.next_observations[(side.pos - len(dones)) % side.buffer_size, 0]
@@ -562,13 +570,21 @@ class TransferAlgorithm(Resumable):
             if len(recent) == RECENT_EPISODES:
                 self.keep_if_best(float(np.mean(recent)))
 
-    def _store_last_step(self, callback: BaseCallback) -> None:
-        """Keep the target step after which a callback stopped: SB3 drops it, and ``_last_obs`` would stay behind."""
-        step = callback.locals
+    def store_step(self, step: dict[str, Any]) -> None:
+        """Finish a target step as SB3 does after its callback, where SB3 itself does not get to it.
+
+        :param step: the locals of SB3's collection that ``checkpoint.STEP`` names
+        """
+        assert self.target_env is not None
+        normaliser, self._vec_normalize_env = self._vec_normalize_env, unwrap_vec_normalize(self.target_env)
         self._update_info_buffer(step["infos"], step["dones"])
-        self._episode_num += int(step["dones"].sum())
-        names = ("buffer_actions", "new_obs", "rewards", "dones", "infos")
-        self._store_transition(self.replay_buffer, *(step[name] for name in names))
+        self._store_transition(self.replay_buffer, *(step[name] for name in checkpoint.STEP))
+        self._vec_normalize_env = normaliser
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        for i in np.flatnonzero(step["dones"]):
+            self._episode_num += 1
+            if self.action_noise is not None:
+                self.action_noise.reset(**({"indices": [i]} if len(step["dones"]) > 1 else {}))
 
     def _count_source_steps(self, callback: BaseCallback) -> bool:
         """What stands in for a target step when the target is a log: ``num_timesteps`` counts source steps."""

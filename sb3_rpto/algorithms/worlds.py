@@ -29,8 +29,8 @@ class TargetLedger(VecEnvWrapper):
     def __init__(self, venv: VecEnv, spent: dict[str, int] | None = None) -> None:
         super().__init__(venv)
         self.spent: Counter[str] = Counter(spent or {})
-        #: the observation that followed a step whose transition is not stored yet; (n_envs, observation_dim), raw
-        self.unstored: np.ndarray | None = None
+        #: whether a step was taken whose transition is not stored yet
+        self.unstored = False
         self._purpose = "other"
         self._allowance: int | None = None
 
@@ -58,12 +58,12 @@ class TargetLedger(VecEnvWrapper):
     def step_wait(self) -> Any:
         """The target's answer, unchanged."""
         answer = self.venv.step_wait()
-        self.unstored = answer[0]  # type: ignore[assignment]  # a flat Box, checked at construction
+        self.unstored = True  # not before: the step may be interrupted
         return answer
 
     def reset(self) -> Any:
         """Reset the target; a reset is not counted as a step."""
-        self.unstored = None
+        self.unstored = False
         return self.venv.reset()
 
 
