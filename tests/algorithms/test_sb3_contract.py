@@ -721,22 +721,48 @@ class Restorable(Drift):
 
 
 @ours
+@pytest.mark.parametrize("saved_at", [14, 20])
 @pytest.mark.parametrize("normalise", [False, True])
-def test_a_checkpoint_of_a_callback_goes_on_with_true_transitions(cls, normalise, tmp_path):
-    """The callback saves between the step and its storing; the resumed run must not pair the old observation with
-    the new state."""
+def test_a_callbacks_checkpoint_resumes_as_if_never_stopped(cls, normalise, saved_at, tmp_path):
+    """SB3 calls the callback between the step and its storing; the twentieth step also ends an episode."""
 
     def source():
-        return VecNormalize(make_vec_env(lambda: Restorable(0.0))) if normalise else Restorable(0.0)
+        return VecNormalize(make_vec_env(lambda: Restorable(0.0), seed=0)) if normalise else Restorable(0.0)
 
-    model = build(cls, source(), Restorable())
-    learn(model, 20, callback=CheckpointCallback(7, str(tmp_path), save_replay_buffer=True))
-    resumed = load(cls, tmp_path / "rl_model_14_steps", source(), Restorable())
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(2), 0.1 * np.ones(2))
+    env = source()
+    statistics = CheckpointCallback(saved_at, str(tmp_path), save_replay_buffer=True, save_vecnormalize=True)
+    unbroken = learn(build(cls, env, Restorable(), action_noise=noise), 34, callback=statistics)
+    env = source()
+    if normalise:
+        env = VecNormalize.load(str(tmp_path / f"rl_model_vecnormalize_{saved_at}_steps.pkl"), env.venv)
+    resumed = load(cls, tmp_path / f"rl_model_{saved_at}_steps", env, Restorable())
+    resumed.load_replay_buffer(tmp_path / f"rl_model_replay_buffer_{saved_at}_steps")
+    learn(resumed, 34 - saved_at, reset_num_timesteps=False)
+    assert resumed.num_timesteps == resumed.replay_buffer.size() == 34
+    assert resumed.target_spent == {"learning": 34}
+    for name in ("_n_updates", "_episode_num", "source_timesteps", "_actor_updates", "_since_fit"):
+        assert getattr(resumed, name) == getattr(unbroken, name), name
+    for side in ("source", "target"):
+        for name in ("observations", "next_observations", "actions", "rewards"):
+            one, other = (getattr(getattr(model.replay_buffer, side), name) for model in (resumed, unbroken))
+            np.testing.assert_array_equal(one, other, err_msg=f"{side} {name}")
+    assert physics_hold(resumed.replay_buffer.target)
+    for name, value in unbroken.policy.state_dict().items():
+        assert th.equal(value, resumed.policy.state_dict()[name]), name
+
+
+@ours
+@pytest.mark.parametrize("train_freq", [4, (1, "episode")])
+def test_a_checkpoint_inside_a_longer_rollout_keeps_every_transition_and_update(cls, train_freq, tmp_path):
+    settings = {"train_freq": train_freq, "gradient_steps": -1}
+    save = CheckpointCallback(14, str(tmp_path), save_replay_buffer=True)
+    learn(build(cls, Restorable(0.0), Restorable(), **settings), 20, callback=save)
+    resumed = load(cls, tmp_path / "rl_model_14_steps", Restorable(0.0), Restorable())
     resumed.load_replay_buffer(tmp_path / "rl_model_replay_buffer_14_steps")
     learn(resumed, 20, reset_num_timesteps=False)
+    assert resumed.num_timesteps == resumed.replay_buffer.size() == resumed._n_updates == 34
     assert physics_hold(resumed.replay_buffer.target)
-    assert resumed.target_spent == {"learning": 34}
-    assert resumed.num_timesteps == 34
 
 
 @ours

@@ -314,7 +314,7 @@ def test_collect_rollouts_calls_back_before_it_stores():
 
 
 def test_collect_rollouts_drops_the_step_after_which_a_callback_stops():
-    """Ours stores it (``_store_last_step``); if SB3 does too one day, ours would store it twice."""
+    """Ours stores it (``store_step``); if SB3 does too one day, ours would store it twice."""
     model = sac().learn(50, callback=lambda local, _: local["self"].num_timesteps < 7)
     assert (model.num_timesteps, model.replay_buffer.size()) == (7, 6)
     model = build(RPO).learn(50, callback=lambda local, _: local["self"].num_timesteps < 7, source_timesteps=0)
