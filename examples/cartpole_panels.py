@@ -1,0 +1,229 @@
+"""The paper's four CartPole panels, and a fifth where a real gap exists.
+
+    python examples/cartpole_panels.py --quick     # one seed, small budgets, a few minutes
+    python examples/cartpole_panels.py             # five seeds; resumable; results in examples/results/cartpole
+
+Source: ContinuousCartPole, pole 1.0 m. Panels: (a) RPO against fine-tuned SAC at 1.2 m; (b) RPO over a range of
+lengths until it fails; (c) RTO's estimate of the length for several true lengths; (d) all methods at 2.0 m; (e) all
+methods under three larger shifts. The shifts of (e) were fixed by the zero-shot return of one policy that is not among
+the five seeds', before any method ran on them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import warnings
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+
+import gymnasium as gym
+import pandas as pd
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from tqdm import tqdm
+
+import sb3_rpto  # noqa: F401  (registers the environment)
+from sb3_rpto.experiments.report import iqm_interval, summarise
+from sb3_rpto.experiments.run import evaluate, transfer
+
+SAC_SETTINGS = {"policy_kwargs": {"net_arch": [64, 64]}, "learning_rate": 1e-3, "gamma": 0.995}
+SHIFTS = {"length 4 m": {"pole_length": 4.0}, "gravity 40 m/s2": {"gravity": 40.0}, "force 1.5 N": {"force_scale": 1.5}}
+METHODS = {
+    "RPTO": ("rpto", {"dynamics": "physical"}),
+    "RPO": ("rpo", {}),
+    "SAC-warm": ("sac-warm", {"gradient_steps": 1}),
+    "SAC-warm, 10 updates": ("sac-warm", {"gradient_steps": 10}),
+    "SAC from scratch": ("sac", {**SAC_SETTINGS, "gradient_steps": 10}),
+}
+COLOURS = dict(zip(METHODS, ("C3", "C0", "C1", "C5", "C7")))
+
+
+def cartpole(constants: dict[str, float]) -> gym.Env:
+    return gym.make("rpto/ContinuousCartPole-v0", **constants)
+
+
+def jobs(seeds: list[int], budget: int, lengths: list[float], shifts: dict[str, dict[str, float]]) -> list[dict]:
+    """Every run of the study, as plain data."""
+    every = max(budget // 10, 50)
+    listed = []
+
+    def add(panel: str, label: str, target: dict[str, float], steps: int = budget, **more: object) -> None:
+        for seed in seeds:
+            job = {"panel": panel, "label": label, "target": target, "seed": seed, "budget": steps, "every": every}
+            listed.append({**job, **more})
+
+    for label in ("RPO", "SAC-warm", "SAC-warm, 10 updates"):
+        add("a", label, {"pole_length": 1.2})
+    for length in lengths:
+        add("b", "RPO", {"pole_length": length}, every=budget)
+    for length in lengths:
+        add("c", "RTO", {"pole_length": length}, every=max(budget // 20, 25))
+    for label in METHODS:
+        add("d", label, {"pole_length": 2.0})
+        for name, target in shifts.items():
+            add(f"e: {name}", label, target)
+    return listed
+
+
+def source_policy(folder: Path, seed: int) -> str:
+    """Train in the source until the pole stands twice in a row; keep the best policy by evaluations in the source."""
+    path = folder / f"source_{seed}.zip"
+    if path.exists():
+        return str(path)
+    _prepare_worker()
+    model = SAC("MlpPolicy", cartpole({}), seed=1000 + seed, device="cpu", **SAC_SETTINGS)
+    evaluation = make_vec_env(partial(cartpole, {}), n_envs=20)
+    best, standing = -1.0, 0
+    for _ in range(25):
+        model.learn(1_000, reset_num_timesteps=False)
+        reached = evaluate(model, evaluation, 20, seed)
+        standing = standing + 1 if reached >= 500 else 0
+        if reached >= best:
+            best = reached
+            model.save(path)
+        if standing == 2:
+            break
+    return str(path)
+
+
+def run(job: dict, folder: Path, source_model: str) -> Path:
+    """One run; its result file is written whole, so a killed study goes on where it stopped."""
+    name = "_".join([job["panel"], job["label"], *(f"{k}={v}" for k, v in job["target"].items()), str(job["seed"])])
+    path = folder / f"{name.replace(' ', '-').replace('/', '')}.json"
+    if path.exists():
+        return path
+    _prepare_worker()
+    method, kwargs = METHODS.get(job["label"], ("rto", {"dynamics": "physical", "gradient_steps": 1}))
+    kwargs = dict(kwargs)
+    read = None
+    if method in ("rto", "rpto"):
+        kwargs["declared"] = list(job["target"])
+        read = _estimate
+    rows = transfer(
+        method,
+        source_model,
+        partial(cartpole, {}),
+        partial(cartpole, job["target"]),
+        job["budget"],
+        every=job["every"],
+        seed=job["seed"],
+        n_source_envs=20 if method == "rpo" else 1,
+        read=read,
+        **kwargs,
+    )
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps([{**job, **row} for row in rows]))
+    temporary.replace(path)
+    return path
+
+
+def _estimate(model) -> dict[str, float]:
+    return {"estimate": next(iter(model.dynamics.describe().values()))}
+
+
+def _prepare_worker() -> None:
+    warnings.filterwarnings("ignore", message="Evaluation environment is not wrapped")
+    warnings.filterwarnings("ignore", message="You are probably loading")
+    th.set_num_threads(1)
+    th.set_float32_matmul_precision("medium")
+
+
+def plot(rows: pd.DataFrame, path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    shifts = sorted(panel for panel in rows.panel.unique() if panel.startswith("e"))
+    figure, axes = plt.subplots(2, 4, figsize=(18, 8), constrained_layout=True)
+    axes = axes.flatten()
+
+    def curves(axis, panel: str, title: str) -> None:
+        part = summarise(rows[rows.panel == panel], ["label", "steps"])
+        for label, line in part.groupby("label", sort=False):
+            axis.plot(line.steps, line.iqm, label=label, color=COLOURS[label])
+            axis.fill_between(line.steps, line.low, line.high, alpha=0.15, color=COLOURS[label], linewidth=0)
+        axis.set(title=title, xlabel="target steps", ylabel="return (IQM, 95 % interval)", ylim=(0, 520))
+
+    curves(axes[0], "a", "(a) pole 1.2 m")
+    axes[0].legend(fontsize=8)
+    swept = rows[rows.panel == "b"].assign(length=lambda frame: [target["pole_length"] for target in frame.target])
+    for steps, label in ((0, "zero-shot"), (swept.steps.max(), f"RPO, {swept.steps.max()} target steps")):
+        line = summarise(swept[swept.steps == steps], ["length"])
+        bars = [line.iqm - line.low, line.high - line.iqm]
+        axes[1].errorbar(line.length, line.iqm, bars, marker="o", capsize=3, label=label)
+    axes[1].set(title="(b) RPO over pole lengths", xlabel="pole length of the target [m]", ylabel="return")
+    axes[1].legend(fontsize=8)
+    fitted = rows[rows.panel == "c"].assign(length=lambda frame: [target["pole_length"] for target in frame.target])
+    for length, line in fitted.groupby("length"):
+        middle = summarise(line, ["steps"], "estimate")
+        (drawn,) = axes[2].plot(middle.steps, middle.iqm, label=f"true {length:g} m")
+        axes[2].axhline(length, color=drawn.get_color(), linestyle=":", linewidth=1)
+    axes[2].set(title="(c) RTO's estimate of the length", xlabel="target steps", ylabel="pole length [m]")
+    axes[2].legend(fontsize=7)
+    curves(axes[3], "d", "(d) pole 2.0 m")
+    for axis, panel in zip(axes[4:], shifts):
+        curves(axis, panel, f"({panel.replace(':', ')')}")
+    axes[4].legend(fontsize=8)
+    for axis in axes[4 + len(shifts) :]:
+        axis.axis("off")
+    figure.savefig(path, dpi=90)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="one seed and small budgets: shows that it works")
+    parser.add_argument("--workers", type=int, default=2, help="runs side by side")
+    parser.add_argument("--runs", type=Path, default=Path("runs/cartpole"), help="where single runs are kept")
+    parser.add_argument("--out", type=Path, help="where figure and tables go")
+    arguments = parser.parse_args()
+    if arguments.quick:
+        seeds, budget, lengths, shifts = [0], 300, [1.2, 3.0], dict(list(SHIFTS.items())[:1])
+        arguments.runs = arguments.runs / "quick"
+    else:
+        seeds, budget, lengths, shifts = list(range(5)), 1000, [0.5, 0.8, 1.2, 1.6, 2.0, 3.0, 4.0, 5.0], SHIFTS
+    out = arguments.out or (arguments.runs if arguments.quick else Path(__file__).parent / "results" / "cartpole")
+    for folder in (arguments.runs, out):
+        folder.mkdir(parents=True, exist_ok=True)
+
+    todo = jobs(seeds, budget, lengths, shifts)
+    with ProcessPoolExecutor(arguments.workers) as pool:
+        train = partial(source_policy, arguments.runs)
+        sources = dict(zip(seeds, tqdm(pool.map(train, seeds), total=len(seeds), desc="source policies")))
+        futures = [pool.submit(run, job, arguments.runs, sources[job["seed"]]) for job in todo]
+        files = [future.result() for future in tqdm(futures, desc="runs")]
+    rows = pd.DataFrame([row for file in files for row in json.loads(file.read_text())])
+
+    rows.drop(columns=["budget", "every", "method"]).to_csv(out / "runs.csv", index=False)
+    last = rows[rows.groupby(["panel", "label", "seed", rows.target.astype(str)]).steps.transform("max") == rows.steps]
+    lines = []
+    for (panel, label, target), group in last.groupby(["panel", "label", last.target.astype(str)], sort=False):
+        middle, low, high = iqm_interval(group["return"].to_numpy())
+        per_step = group[["updates", "source_steps", "seconds"]].div(group.steps.clip(lower=1), axis=0).mean().round(4)
+        line = {"panel": panel, "target": target, "method": label, "steps": int(group.steps.max()), "seeds": len(group)}
+        costs = {f"{name}_per_target_step": value for name, value in per_step.items()}
+        lines.append({**line, "iqm": round(middle, 1), "low": round(low, 1), "high": round(high, 1), **costs})
+    table = pd.DataFrame(lines)
+    table.to_csv(out / "summary.csv", index=False)
+    plot(rows, out / "panels.png")
+    manifest = {
+        "command": f"python examples/cartpole_panels.py{' --quick' if arguments.quick else ''}",
+        "seeds": seeds,
+        "budget": budget,
+        "sac": SAC_SETTINGS,
+        "shifts": shifts,
+        "versions": {name: version(name) for name in ("sb3-rpto", "torch", "stable-baselines3", "gymnasium", "numpy")},
+        "python": platform.python_version(),
+    }
+    (out / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
+    print(table.to_string(index=False))
+    print(f"figure and tables: {out}")
+
+
+if __name__ == "__main__":
+    main()
