@@ -1,0 +1,126 @@
+"""The docs are true: their code runs, what they name exists, and every logged key is explained.
+
+Blocks that begin with "```python run" are executed, those of one page in order and in one namespace. Budgets are
+written with an underscore (20_000) there and are run as ``BUDGET`` steps.
+"""
+
+import re
+from itertools import product
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+from conftest import ALGORITHMS, SMALL_POLICY, pendulum, small
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_rpto import RPTO
+from sb3_rpto.callbacks import RelativityGapCallback
+from sb3_rpto.dynamics.ensemble import EnsembleDynamics
+
+ROOT = Path(__file__).parents[1]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+BUDGET = "10"
+
+by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+
+
+def runnable(page: Path) -> list[str]:
+    return re.findall(r"^```python run\n(.*?)^```$", page.read_text(), re.DOTALL | re.MULTILINE)
+
+
+def prose(page: Path) -> str:
+    """The page without its code blocks."""
+    return re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("page", [page for page in PAGES if runnable(page)], ids=lambda page: page.name)
+def test_code_blocks_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(EnsembleDynamics.__init__.__kwdefaults__, "hidden", (16, 16))
+    namespace = {"__name__": "__main__"}
+    for block in runnable(page):
+        exec(compile(re.sub(r"\b\d+(_\d{3})+\b", BUDGET, block), str(page), "exec"), namespace)
+
+
+@by_page
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"(?<!!)\[[^\]]+\]\(([^)]+)\)", prose(page)):
+        if not target.startswith("http"):
+            path, _, anchor = target.partition("#")
+            linked = page.parent / path if path else page
+            assert linked.exists(), target
+            headings = re.findall(r"^#+ (.+)$", linked.read_text(), re.MULTILINE) if anchor else []
+            slugs = [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
+            assert not anchor or anchor in slugs, target
+
+
+@by_page
+def test_what_is_named_exists(page):
+    """``folder/file.py:name`` is defined in that file of the package, ``test_name`` in the tests."""
+    for path, name in re.findall(r"`([\w/]+\.py):([\w.]+)`", prose(page)):
+        source = (ROOT / "sb3_rpto" / path).read_text()
+        for part in name.split("."):
+            assert re.search(rf"^\s*(def|class) {part}\b|^\s*{part}\b.*=", source, re.MULTILINE), f"{path}:{name}"
+    tests = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
+    for name in re.findall(r"`(test_\w+)`", prose(page)):
+        assert f"def {name}(" in tests, name
+
+
+def explained() -> set[str]:
+    """The keys in the first column of the page's tables; ``<name>`` stands for any name."""
+    rows = re.findall(r"^\| (`.+?`) \|", (ROOT / "docs" / "logged-keys.md").read_text(), re.MULTILINE)
+    return {key for row in rows for key in re.findall(r"`([^`]+)`", row)}
+
+
+def logged(model, **kwargs) -> set[str]:
+    """The keys of a run."""
+    keys: set[str] = set()
+    model.set_logger(configure(None, []))
+    record = model.logger.record
+    model.logger.record = lambda key, value, *args, **more: (keys.add(key), record(key, value, *args, **more))
+    model.learn(**{"total_timesteps": 220, "source_timesteps": 210, "log_interval": 1, **kwargs})
+    return keys
+
+
+class Succeeds(gym.Wrapper):
+    def step(self, action):
+        *answer, info = super().step(action)
+        return *answer, {**info, "is_success": True}
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_every_logged_key_is_explained_and_every_explained_key_is_logged(tmp_path):
+    keys: set[str] = set()
+    for cls in ALGORITHMS:
+        evaluation = EvalCallback(Monitor(Succeeds(pendulum(12.0))), eval_freq=210, n_eval_episodes=1, verbose=0)
+        callback = [evaluation, RelativityGapCallback(frequency=210)]
+        keys |= logged(small(cls, target=Succeeds(pendulum(12.0)), use_sde=True, gradient_steps=1), callback=callback)
+    cartpole = "rpto/ContinuousCartPole-v0"
+    physical = {"dynamics": "physical", "declared": ["pole_length", "gravity"], "policy_kwargs": SMALL_POLICY}
+    model = RPTO("MlpPolicy", cartpole, target_env=gym.make(cartpole, pole_length=2.0), gradient_steps=1, **physical)
+    keys |= logged(model)
+    names = {"gravity", "pole_length"}
+    patterns = {key: re.escape(key).replace("<name>", f"({'|'.join(names)})") for key in explained()}
+    assert {key for key in keys if not any(re.fullmatch(p, key) for p in patterns.values())} == set()
+    assert {key for key, p in patterns.items() if not any(re.fullmatch(p, k) for k in keys)} == set()
+
+
+def test_the_preset_table_is_the_files():
+    from sb3_rpto.presets import preset_names, resolve_preset
+
+    text = (ROOT / "docs" / "how-it-works.md").read_text()
+    header, *rows = [
+        [cell.strip(" `") for cell in line.strip("|").split("|")]
+        for line in re.findall(r"^\| (?:`?\w+`? \| ){4}.*$", text, re.MULTILINE)
+        if "preset" in line or line.split("|")[1].strip(" `") in preset_names()
+    ]
+    assert header[:2] == ["preset", "backend"]
+    assert [row[:2] for row in rows] == [list(p) for p in product(preset_names(), ["real", "ensemble", "physical"])]
+    for preset, backend, *cells in rows:
+        values = resolve_preset(preset, backend, None, ())
+        values |= values.pop("dynamics_kwargs", {})
+        for name, cell in zip(header[2:], cells):
+            assert cell.replace(",", "") == str(values.get(name, "")), (preset, backend, name)
