@@ -18,6 +18,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_rpto import RPTO
 from sb3_rpto.callbacks import RelativityGapCallback
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
+from sb3_rpto.presets import preset_names, resolve_preset
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
@@ -109,14 +110,9 @@ def test_every_logged_key_is_explained_and_every_explained_key_is_logged(tmp_pat
 
 
 def test_the_preset_table_is_the_files():
-    from sb3_rpto.presets import preset_names, resolve_preset
-
     text = (ROOT / "docs" / "how-it-works.md").read_text()
-    header, *rows = [
-        [cell.strip(" `") for cell in line.strip("|").split("|")]
-        for line in re.findall(r"^\| (?:`?\w+`? \| ){4}.*$", text, re.MULTILINE)
-        if "preset" in line or line.split("|")[1].strip(" `") in preset_names()
-    ]
+    lines = re.findall(rf"^\| ((?:preset|{'|'.join(preset_names())}) \|.*)\|$", text, re.MULTILINE)
+    header, *rows = [[cell.strip() for cell in line.split("|")] for line in lines]
     assert header[:2] == ["preset", "backend"]
     assert [row[:2] for row in rows] == [list(p) for p in product(preset_names(), ["real", "ensemble", "physical"])]
     for preset, backend, *cells in rows:
