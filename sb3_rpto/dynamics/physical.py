@@ -195,7 +195,7 @@ class PhysicalDynamics(Dynamics):
         reached = self.simulate(observations, actions, self.coordinates.double())
         terminations = cartpole_termination(reached, self._thresholds)
         next_observations = reached.to(observations.dtype)
-        return Prediction(next_observations, cartpole_reward(next_observations), terminations)
+        return Prediction(next_observations, cartpole_reward(next_observations, self._thresholds), terminations)
 
     @th.no_grad()
     def error(self, data: Transitions) -> float:
