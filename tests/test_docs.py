@@ -62,6 +62,7 @@ def test_links_lead_somewhere(page):
 def test_what_is_named_exists(page):
     """``folder/file.py:name`` is defined in that file of the package, ``test_name`` in the tests."""
     for path, name in re.findall(r"`([\w/]+\.py):([\w.]+)`", prose(page)):
+        assert (ROOT / "sb3_rpto" / path).exists(), path
         source = (ROOT / "sb3_rpto" / path).read_text()
         for part in name.split("."):
             assert re.search(rf"^\s*(def|class) {part}\b|^\s*{part}\b.*=", source, re.MULTILINE), f"{path}:{name}"
