@@ -23,7 +23,7 @@ ALTERNATION = 5
 
 
 class RelativeUpdate(SAC):
-    """SAC with a batch of its own for the actor, and with trainable dynamics; see :class:`TransferAlgorithm`."""
+    """The updates, on whatever the two replay buffers hold: SAC with a batch of its own for the actor, and RTO."""
 
     #: whether step 6 of Algorithm 1 applies RPO, and whether it applies RTO
     updates_policy: ClassVar[bool]
@@ -40,14 +40,19 @@ class RelativeUpdate(SAC):
     model_train_freq: int
     #: plain SAC in the source is under way
     _pretraining: bool
-    #: target steps since the last update, since the last fit, and actor updates so far
+    #: target steps taken since the last update (with recorded target data: calls of the source), those since the
+    #: last fit, and actor updates so far
     _collected: int
     _since_fit: int
     _actor_updates: int
+    #: recorded data stand in for the target
     _offline: bool
 
-    def _policy_learns(self) -> bool:
-        return self.updates_policy or self._pretraining
+    def update(self) -> None:
+        """Steps 5 and 6: ``gradient_steps`` updates of critic and actor for each new target step, then the dynamics."""
+        updates = self.gradient_steps if self.gradient_steps >= 0 else 1  # SB3: negative means one a step
+        self.train(self._collected * updates, self.batch_size)
+        self.fit_dynamics()
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """Step 5, the critic on D_source, and step 6, the actor by RPO; given the same batch it is SAC's update.
@@ -60,13 +65,14 @@ class RelativeUpdate(SAC):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        losses: dict[str, list[float]] = {}
+        policy_learns = self.updates_policy or self._pretraining
+        losses: dict[str, list[th.Tensor]] = {}
         for gradient_step in range(gradient_steps):
             critic_batch, actor_batch = self.sample_batches(batch_size)
             step_losses: dict[str, th.Tensor] = {}
             step_losses["ent_coef"] = ent_coef = self.temperature()
             # The order is SAC's: the actor samples first, its loss then uses the updated critic.
-            if self._policy_learns():
+            if policy_learns:
                 if self.use_sde:
                     self.actor.reset_noise()
                 actions_pi, log_prob = self.actor.action_log_prob(actor_batch.observations)
@@ -76,18 +82,18 @@ class RelativeUpdate(SAC):
                     _descend(self.ent_coef_optimizer, step_losses["ent_coef_loss"])
             step_losses["critic_loss"] = self.critic_loss(critic_batch, ent_coef)
             _descend(self.critic.optimizer, step_losses["critic_loss"])
-            if self._policy_learns():
+            if policy_learns:
                 step_losses["actor_loss"] = self.actor_loss(actor_batch, actions_pi, log_prob, ent_coef)
                 _descend(self.actor.optimizer, step_losses["actor_loss"])
             if gradient_step % self.target_update_interval == 0:
                 polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
             for name, loss in step_losses.items():
-                losses.setdefault(name, []).append(loss.item())
+                losses.setdefault(name, []).append(loss.detach().reshape(()))
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in losses.items():
-            self.logger.record(f"train/{name}", float(np.mean(values)))
+        for name, values in losses.items():  # read here at once: reading each would wait for the device every step
+            self.logger.record(f"train/{name}", float(np.mean(th.stack(values).tolist())))
 
     def fit_dynamics(self) -> None:
         """Step 6, RTO: every ``model_train_freq`` target steps move phi towards D_target by the weighted loss."""
@@ -114,7 +120,7 @@ class RelativeUpdate(SAC):
         for name, value in {**self.dynamics.fit(data, weights), **self.dynamics.describe()}.items():
             self.logger.record(f"dynamics/{name}", value)
         self.logger.record("dynamics/error", self.dynamics.error(data))
-        if self._offline:
+        if self._offline:  # SB3 writes its logs at the end of target episodes; there are none
             self.dump_logs()
 
     def sample_batches(self, batch_size: int) -> tuple[ReplayBufferSamples, ReplayBufferSamples]:
@@ -139,9 +145,7 @@ class RelativeUpdate(SAC):
         """Soft Bellman residual, Eq. soft_q: half the sum over critics of the mean squared error."""
         with th.no_grad():
             next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
-            next_q = th.cat(self.critic_target(batch.next_observations, next_actions), dim=1).min(dim=1, keepdim=True)[
-                0
-            ]
+            next_q = _smallest(self.critic_target(batch.next_observations, next_actions))
             next_value = next_q - ent_coef * next_log_prob.reshape(-1, 1)
             target = batch.rewards + (1 - batch.dones) * self.gamma * next_value
         return 0.5 * th.stack([F.mse_loss(q, target) for q in self.critic(batch.observations, batch.actions)]).sum()
@@ -150,8 +154,7 @@ class RelativeUpdate(SAC):
         self, batch: ReplayBufferSamples, actions_pi: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor
     ) -> th.Tensor:
         """RPO, Eq. sac: states of the target, values of the source; alpha log pi - min_i Q_i(s, a)."""
-        q_pi = th.cat(self.critic(batch.observations, actions_pi), dim=1).min(dim=1, keepdim=True)[0]
-        return (ent_coef * log_prob - q_pi).mean()
+        return (ent_coef * log_prob - _smallest(self.critic(batch.observations, actions_pi))).mean()
 
     def temperature(self) -> th.Tensor:
         """The current entropy coefficient alpha, without gradient."""
@@ -167,17 +170,27 @@ class RelativeUpdate(SAC):
         with th.no_grad():
             seen = self._normalised(observations)
             actions, log_prob = self.actor.action_log_prob(seen)
-            q = th.cat(self.critic_target(seen, actions), dim=1).min(dim=1)[0]
-            return q - self.temperature() * log_prob
+            return _smallest(self.critic_target(seen, actions))[:, 0] - self.temperature() * log_prob
 
     def q_value(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """min_i Q_target,i(s, a) of raw observations (n, d) and actions in the environment's units -> (n,)."""
-        low, high = (
-            th.as_tensor(bound, device=self.device) for bound in (self.action_space.low, self.action_space.high)
-        )
         with th.no_grad():
-            scaled = 2.0 * (actions - low) / (high - low) - 1.0
-            return th.cat(self.critic_target(self._normalised(observations), scaled.float()), dim=1).min(dim=1)[0]
+            scaled = self.scale_actions(actions).float()
+            return _smallest(self.critic_target(self._normalised(observations), scaled))[:, 0]
+
+    def scale_actions(self, actions: th.Tensor) -> th.Tensor:
+        """Actions in the environment's units -> [-1, 1], the scale of the networks and the buffers; (n, action_dim)."""
+        low, high = self._action_bounds()
+        return 2.0 * (actions - low) / (high - low) - 1.0
+
+    def unscale_actions(self, scaled: th.Tensor) -> th.Tensor:
+        """The inverse of :meth:`scale_actions`."""
+        low, high = self._action_bounds()
+        return low + 0.5 * (scaled + 1.0) * (high - low)
+
+    def _action_bounds(self) -> tuple[th.Tensor, th.Tensor]:
+        space = self.action_space
+        return th.as_tensor(space.low, device=self.device), th.as_tensor(space.high, device=self.device)
 
     def transitions(self, world: World) -> Transitions:
         """All transitions of one world, oldest first, actions in the environment's units, on the model's device."""
@@ -205,9 +218,15 @@ def as_transitions(arrays: dict[str, np.ndarray], policy: SACPolicy, device: th.
 
 
 def _descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
+    """One step of ``optimizer``; only its own parameters get gradients (the actor's loss spares the critic's)."""
     optimizer.zero_grad()
-    loss.backward()
+    loss.backward(inputs=[parameter for group in optimizer.param_groups for parameter in group["params"]])
     optimizer.step()
+
+
+def _smallest(q_values: tuple[th.Tensor, ...]) -> th.Tensor:
+    """The pessimistic estimate min_i Q_i, (n, 1), of what a critic answers."""
+    return th.cat(q_values, dim=1).min(dim=1, keepdim=True)[0]
 
 
 def _concatenate(a: ReplayBufferSamples, b: ReplayBufferSamples) -> ReplayBufferSamples:
