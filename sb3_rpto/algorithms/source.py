@@ -2,24 +2,64 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_rpto.algorithms.worlds import check_finite
+from sb3_rpto.algorithms.update import RelativeUpdate
+from sb3_rpto.algorithms.worlds import check_finite, share_normalisation
 from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
-
-if TYPE_CHECKING:
-    from sb3_rpto.algorithms.transfer import TransferAlgorithm
 
 RolloutStart = Literal["target", "source", "mix"]
 
 
-class EpisodeSource:
+class SourceWorld(ABC):
+    """The world that step 3 acts in."""
+
+    @abstractmethod
+    def interact(self, model: RelativeUpdate, n_steps: int) -> int:
+        """Take at least ``n_steps`` steps and store every transition.
+
+        :param model: whose policy acts and whose D_source is filled
+        :param n_steps: number of transitions
+        :return: the number of transitions stored
+        """
+
+    def log(self) -> dict[str, float]:
+        """What to log of the source's episodes; empty where it has none."""
+        return {}
+
+    def get_state(self) -> dict[str, Any]:
+        """Where the episodes stand, beside the source environment's own state; empty where there are none."""
+        return {}
+
+    def set_state(self, state: dict[str, Any]) -> None:  # noqa: B027
+        """Continue where :meth:`get_state` was called; the source environment's own state is restored elsewhere."""
+
+
+def make_source_world(
+    env: VecEnv, dynamics: Dynamics | None, rollout_start: RolloutStart, num_envs: int
+) -> SourceWorld:
+    """The source as the model's backend rolls it out: itself (no dynamics), branches, or simulated episodes.
+
+    :param env: the real source
+    :param dynamics: the trainable source P_phi, if there is one
+    :param rollout_start: where branches start
+    :param num_envs: number of episodes simulated side by side
+    """
+    if dynamics is None:
+        return EpisodeSource(env)
+    if dynamics.rollout == "branches":
+        return BranchSource(dynamics, rollout_start)
+    return EpisodeSource(share_normalisation(DynamicsVecEnv(dynamics, env, num_envs), env))
+
+
+class EpisodeSource(SourceWorld):
     """Whole episodes of a source VecEnv: the real simulator (RPO) or one that the dynamics answer.
 
     :param env: stepped by the current stochastic policy
@@ -30,20 +70,21 @@ class EpisodeSource:
 
     def __init__(self, env: VecEnv, first_obs: np.ndarray | None = None) -> None:
         self.env = env
+        self._normaliser = unwrap_vec_normalize(env)
         self.returns: deque[float] = deque(maxlen=100)
         self.lengths: deque[int] = deque(maxlen=100)
         self._last_obs = first_obs
         self._last_raw: np.ndarray | None = None if first_obs is None else self._raw(first_obs)
 
-    def interact(self, model: TransferAlgorithm, n_steps: int, random: bool = False) -> int:
-        """Step at least ``n_steps`` times in all environments together and store every transition.
+    def interact(self, model: RelativeUpdate, n_steps: int, random: bool = False) -> int:
+        """Step at least ``n_steps`` times, counted in all environments together, and store every transition.
 
         :param model: whose policy acts and whose D_source is filled
         :param n_steps: number of transitions
         :param random: uniform actions instead of the policy's
         :return: the number of transitions stored
         """
-        normaliser = unwrap_vec_normalize(self.env)
+        normaliser = self._normaliser
         if self._last_obs is None:
             self._last_obs = np.asarray(self.env.reset())
             self._last_raw = self._raw(self._last_obs)
@@ -76,8 +117,8 @@ class EpisodeSource:
         return steps
 
     def _raw(self, obs: Any) -> np.ndarray:
-        normaliser = unwrap_vec_normalize(self.env)
-        return np.array(obs if normaliser is None else normaliser.get_original_obs())
+        """The observations that the environments just gave, not normalised; a copy."""
+        return np.array(obs if self._normaliser is None else self._normaliser.get_original_obs())
 
     def log(self) -> dict[str, float]:
         """Mean return and length of the last 100 source episodes."""
@@ -86,20 +127,20 @@ class EpisodeSource:
         return {"ep_rew_mean": float(np.mean(self.returns)), "ep_len_mean": float(np.mean(self.lengths))}
 
     def get_state(self) -> dict[str, Any]:
-        """Where the episodes stand, beside the source environment's own state."""
+        """Where the episodes stand; see :meth:`SourceWorld.get_state`."""
         inner = self.env.unwrapped
         model = inner.get_state() if isinstance(inner, DynamicsVecEnv) else None
         return {"model": model, **{name: getattr(self, name) for name in self._STATE}}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Continue where :meth:`get_state` was called; the source environment's own state is restored elsewhere."""
+        """Continue where :meth:`get_state` was called."""
         if state["model"] is not None:
             self.env.unwrapped.set_state(state["model"])  # type: ignore[attr-defined]
         for name in self._STATE:
             setattr(self, name, state[name])
 
 
-class BranchSource:
+class BranchSource(SourceWorld):
     """One-step branches of the learned dynamics (horizon 1) from states of the target, the source, or both.
 
     :param dynamics: answers the step
@@ -110,16 +151,15 @@ class BranchSource:
         self.dynamics = dynamics
         self.rollout_start = rollout_start
 
-    def interact(self, model: TransferAlgorithm, n_steps: int) -> int:
-        """Branch ``n_steps`` times and store every transition; arguments as :meth:`EpisodeSource.interact`."""
+    def interact(self, model: RelativeUpdate, n_steps: int) -> int:
+        """Branch ``n_steps`` times, all at once; see :meth:`SourceWorld.interact`."""
         starts = self._starts(model, n_steps)
         normaliser = model.get_vec_normalize_env()
         seen = starts if normaliser is None else normaliser.normalize_obs(starts)
         model.policy.set_training_mode(False)
         with th.no_grad():
             scaled = model.actor(th.as_tensor(seen, device=model.device).float(), deterministic=False)
-        low, high = (th.as_tensor(b, device=model.device) for b in (model.action_space.low, model.action_space.high))
-        actions = low + 0.5 * (scaled + 1.0) * (high - low)
+        actions = model.unscale_actions(scaled)
         answer = self.dynamics.step(th.as_tensor(starts, device=model.device), actions, deterministic=False)
         next_obs, rewards = answer.next_observations.cpu().numpy(), answer.rewards.cpu().numpy()
         check_finite("modelled source", observation=next_obs, reward=rewards)
@@ -127,7 +167,7 @@ class BranchSource:
         model.replay_buffer.append("source", starts, next_obs, scaled.cpu().numpy(), rewards, terminations)
         return n_steps
 
-    def _starts(self, model: TransferAlgorithm, n: int) -> np.ndarray:
+    def _starts(self, model: RelativeUpdate, n: int) -> np.ndarray:
         """Observations to branch from, (n, observation_dim), raw."""
         buffer = model.replay_buffer
         n_target = {"target": n, "source": 0, "mix": n // 2}[self.rollout_start]
@@ -141,14 +181,3 @@ class BranchSource:
             rows = np.random.randint(len(buffer.source_starts), size=n - n_target)
             pools.append(buffer.source_starts[rows])
         return np.concatenate(pools)
-
-    def log(self) -> dict[str, float]:
-        """Nothing: branches have no episodes."""
-        return {}
-
-    def get_state(self) -> dict[str, Any]:
-        """Nothing to keep: branches have no episodes."""
-        return {}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Nothing to restore."""
