@@ -98,7 +98,7 @@ def share_normalisation(venv: VecEnv, source: VecEnv | None) -> VecEnv:
 def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
     """Refuse what the algorithms are not written for.
 
-    :raises NotImplementedError: for observations that are not a flat Box and for actions that are not a Box
+    :raises NotImplementedError: for observations or actions that are not a flat Box
     """
     if not isinstance(observation_space, spaces.Box) or is_image_space(observation_space):
         raise NotImplementedError(
@@ -113,6 +113,11 @@ def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) ->
     if not isinstance(action_space, spaces.Box):
         raise NotImplementedError(
             f"env has the action space {action_space}; only continuous (Box) actions are supported"
+        )
+    if len(action_space.shape) != 1:
+        raise NotImplementedError(
+            f"env has actions of shape {action_space.shape}; only flat ones are supported (let a "
+            "gymnasium.wrappers.TransformAction with a flat Box reshape them for the environment)"
         )
 
 
@@ -196,20 +201,18 @@ class NullShiftCheck:
         :param actions: (1, action_dim), what the target's first environment received
         :param next_observation: (observation_dim,), what it answered
         :param done: whether its episode ended
-        :return: True once all of ``n_steps`` transitions (or the first episode) agreed, None while it is not known
+        :return: True once all of ``n_steps`` transitions (or the first episode) agreed, False once one did not or
+            when nothing can be claimed, None while it is not known
         """
         if self._copy is None:
-            return None
+            return False
         observations, _, copy_done, infos = self._copy.step(actions)
         answer = infos[0].get("terminal_observation", np.asarray(observations)[0])
         if not np.allclose(answer, next_observation, rtol=1e-9, atol=1e-9) or bool(copy_done[0]) != done:
             self._copy = None
-            return None
+            return False
         self._left -= 1
-        if self._left > 0 and not done:
-            return None
-        self._copy = None
-        return True
+        return True if self._left == 0 or done else None
 
 
 def _single_state(venv: VecEnv) -> dict[str, Any] | None:
