@@ -8,31 +8,38 @@ import pathlib
 import random
 import warnings
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
-from sb3_rpto.algorithms.snapshots import PolicySnapshots
+from sb3_rpto.algorithms.bookkeeping import STEP, TwoWorlds
 from sb3_rpto.algorithms.worlds import find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.envs.state import restore_state, save_state
 
-if TYPE_CHECKING:
-    from sb3_rpto.algorithms.transfer import TransferAlgorithm
-
 Self = TypeVar("Self", bound="Resumable")
 
-#: what SB3's collection knows of a step when it calls back, before it stores the transition
-STEP = ("buffer_actions", "new_obs", "rewards", "dones", "infos")
+#: Kept out of the zip: saved by other means, rebuilt, or of no use without the environments.
+NOT_SAVED = (
+    "target_env",
+    "dynamics",
+    "_source_world",
+    "_null_check",
+    "_passed",
+    "_last_obs",
+    "_last_original_obs",
+    "_source_first_obs",
+    "_callback",
+)
 
 
-class Resumable(PolicySnapshots):
+class Resumable(TwoWorlds):
     """A complete checkpoint: SB3's zip with the dynamics, and where both worlds and the random streams stand."""
 
-    _resume_state: dict[str, Any] | None
+    #: whether the policy knows the source, by a warm start or by training there
     _warm: bool
 
     def save(
@@ -42,10 +49,9 @@ class Resumable(PolicySnapshots):
         include: Iterable[str] | None = None,
     ) -> None:
         """Save all that a resumed run needs, except the replay buffers (``save_replay_buffer``); atomic for paths."""
-        target_env = _whole(self).target_env
-        if target_env is not None:  # a callback may save in the middle of a rollout
-            _whole(self).target_spent = dict(find_ledger(target_env).spent)
-        self._resume_state = self._resume_state or capture(_whole(self))
+        if self.target_env is not None:  # a callback may save in the middle of a rollout
+            self.target_spent = dict(find_ledger(self.target_env).spent)
+        self._resume_state = self._resume_state or capture(self)
         try:
             write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
         finally:
@@ -99,7 +105,7 @@ class Resumable(PolicySnapshots):
             raise ValueError(f"{path} was saved by {saved_by}, {cls.__name__} cannot continue it; load it there")
         model._warm = model._resume_state["warm"]
         if target_env is not None:
-            _whole(model).set_target_env(target_env)
+            model.set_target_env(target_env)
         return model
 
     def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto") -> None:
@@ -108,18 +114,7 @@ class Resumable(PolicySnapshots):
         self._warm = True
 
     def _excluded_save_params(self) -> list[str]:
-        own = [
-            "target_env",
-            "dynamics",
-            "_source_world",
-            "_null_check",
-            "_passed",
-            "_last_obs",
-            "_last_original_obs",
-            "_source_first_obs",
-            "_callback",
-        ]
-        return [*super()._excluded_save_params(), *own]
+        return [*super()._excluded_save_params(), *NOT_SAVED]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
@@ -130,11 +125,7 @@ class Resumable(PolicySnapshots):
         return state_dicts, variables
 
 
-def _whole(model: Resumable) -> TransferAlgorithm:
-    return cast("TransferAlgorithm", model)  # the one class that is built on Resumable
-
-
-def capture(model: TransferAlgorithm) -> dict[str, Any]:
+def capture(model: Resumable) -> dict[str, Any]:
     """Where the two worlds and the random streams stand, as plain data."""
     return {
         "random": random.getstate(),
@@ -146,12 +137,11 @@ def capture(model: TransferAlgorithm) -> dict[str, Any]:
         "last_obs": model._last_obs,
         "last_original_obs": model._last_original_obs,
         "unstored_step": _unstored_step(model),
-        "null_check_done": model._null_check is None,
         "warm": model._warm,
     }
 
 
-def _unstored_step(model: TransferAlgorithm) -> dict[str, Any] | None:
+def _unstored_step(model: Resumable) -> dict[str, Any] | None:
     """The target step that is taken and not yet stored: SB3 calls callbacks, which may save, between the two."""
     if model.target_env is None or model._callback is None or not find_ledger(model.target_env).unstored:
         return None
@@ -160,7 +150,7 @@ def _unstored_step(model: TransferAlgorithm) -> dict[str, Any] | None:
     return {"raw": raw, "known": {name: model._callback.locals[name] for name in STEP}}
 
 
-def resume(model: TransferAlgorithm) -> bool:
+def resume(model: Resumable) -> bool:
     """Put the worlds and the random streams back to where the loaded checkpoint left them.
 
     A world that cannot be put back begins a new episode, and a warning says which.
@@ -185,8 +175,6 @@ def resume(model: TransferAlgorithm) -> bool:
             assert model.target_env is not None
             restore_state(find_ledger(model.target_env).venv, state["target"])
             model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
-            if state["null_check_done"]:
-                model._null_check = None
             if state["unstored_step"] is not None:
                 inside = True
                 normaliser = unwrap_vec_normalize(model.target_env)

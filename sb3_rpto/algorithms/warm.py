@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import copy
 import pathlib
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.sac.policies import SACPolicy
 
+from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.buffers import World, load_transitions
-
-if TYPE_CHECKING:
-    from sb3_rpto.algorithms.transfer import TransferAlgorithm
-
-Model = TypeVar("Model", bound="TransferAlgorithm")
+from sb3_rpto.dynamics.base import Dynamics
 
 #: Source steps that fit phi_0 when no source data are given, and the cap of gradient steps of that fit.
 PHI_0_STEPS, PHI_0_UPDATES = 25_000, 5_000
@@ -28,19 +23,17 @@ FIRST_SOURCE_STEPS = 5_000
 CARRIED = ("learning_rate", "batch_size", "tau", "gamma", "ent_coef", "target_entropy", "use_sde", "sde_sample_freq")
 
 
-def from_source(
-    cls: type[Model],
-    source_model: SAC | str | pathlib.Path,
-    env: GymEnv | str,
-    target_env: GymEnv | str | None,
-    source_data: ReplayBuffer | str | pathlib.Path | None,
-    kwargs: dict[str, Any],
-) -> Model:
-    """See :meth:`TransferAlgorithm.from_source`."""
-    sac = source_model if isinstance(source_model, SAC) else SAC.load(source_model, device=kwargs.get("device", "auto"))
-    carried = {name: getattr(sac, name) for name in CARRIED}
-    carried["policy_kwargs"] = {name: value for name, value in sac.policy_kwargs.items() if name != "use_sde"}
-    model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **{**carried, **kwargs})
+def carried_arguments(sac: SAC) -> dict[str, Any]:
+    """Constructor arguments that a warm start takes over from the source model."""
+    policy_kwargs = {name: value for name, value in sac.policy_kwargs.items() if name != "use_sde"}
+    return {**{name: getattr(sac, name) for name in CARRIED}, "policy_kwargs": policy_kwargs}
+
+
+def carry_over(sac: SAC, model: Resumable) -> None:
+    """Take over actor, critics, their targets, the temperature and the state of every optimiser.
+
+    :raises ValueError: when the source model's spaces or networks are not the model's
+    """
     for name in ("observation_space", "action_space"):
         ours, theirs = getattr(model, name), getattr(sac, name)
         if ours.shape != theirs.shape:
@@ -50,21 +43,22 @@ def from_source(
     except RuntimeError as error:
         raise ValueError(f"source_model's networks do not fit policy_kwargs={model.policy_kwargs}: {error}") from error
     _carry_optimizers(sac, model)
-    if source_data is not None:
-        arrays = _checked(load_transitions(source_data), model, "source_data")
-        _fill_source(model, arrays)
     model._warm = True
-    return model
 
 
-def fill_target(model: TransferAlgorithm, target_data: ReplayBuffer | str | pathlib.Path) -> None:
+def fill_source(model: Resumable, source_data: ReplayBuffer | str | pathlib.Path) -> None:
+    """Put recorded source transitions into D_source; branches may start from their states."""
+    arrays = _checked(load_transitions(source_data), model, "source_data")
+    _append_newest(model, "source", arrays)
+    model.replay_buffer.source_starts = arrays["observations"].astype(model.observation_space.dtype)
+
+
+def fill_target(model: Resumable, target_data: ReplayBuffer | str | pathlib.Path) -> None:
     """Put recorded target transitions into D_target."""
-    arrays = _checked(load_transitions(target_data), model, "target_data")
-    n = min(len(arrays["rewards"]), model.replay_buffer.target.buffer_size)
-    _append(model, "target", {name: array[-n:] for name, array in arrays.items()})
+    _append_newest(model, "target", _checked(load_transitions(target_data), model, "target_data"))
 
 
-def begin_in_source(model: TransferAlgorithm, source_timesteps: int, progress_bar: bool) -> None:
+def begin_in_source(model: Resumable, source_timesteps: int, progress_bar: bool) -> None:
     """Bring policy, D_source and phi_0 to where Algorithm 1 starts; counts no target step.
 
     A model that knows nothing of the source first trains there by plain SAC. D_source then holds source transitions,
@@ -75,22 +69,33 @@ def begin_in_source(model: TransferAlgorithm, source_timesteps: int, progress_ba
     model._warm = True
     if not model.snapshots:
         model.take_snapshot("source")
-    assert model.env is not None  # learn() has checked
-    network = model.dynamics if model.dynamics is not None and model.dynamics.rollout == "branches" else None
-    if len(model.replay_buffer.source_starts) == 0 and (network is not None or model.replay_buffer.source.size() == 0):
-        needed = PHI_0_STEPS if network is not None else FIRST_SOURCE_STEPS
-        real = EpisodeSource(model.env)
-        model.source_timesteps += real.interact(model, min(needed, model.replay_buffer.source.buffer_size))
-        model.env.reset()
-    if network is not None:
-        if len(model.replay_buffer.source_starts) == 0:
+    # A network must be fitted to describe the source; a physical model comes with the source's constants.
+    learned = model.dynamics if model.dynamics is not None and model.dynamics.rollout == "branches" else None
+    if len(model.replay_buffer.source_starts) == 0:  # neither source_data nor an earlier run gave any
+        if learned is not None:
+            _collect_in_source(model, PHI_0_STEPS)
             model.replay_buffer.source_starts = model.transitions("source").observations.cpu().numpy()[-PHI_0_STEPS:]
-        if not network.fitted:
-            for name, value in network.fit(model.transitions("source"), max_steps=PHI_0_UPDATES).items():
-                model.logger.record(f"dynamics/phi_0_{name}", value)
+        elif model.replay_buffer.source.size() == 0:
+            _collect_in_source(model, FIRST_SOURCE_STEPS)
+    if learned is not None and not learned.fitted:
+        _fit_phi_0(model, learned)
 
 
-def _train_in_source(model: TransferAlgorithm, source_timesteps: int, progress_bar: bool) -> None:
+def _collect_in_source(model: Resumable, n_steps: int) -> None:
+    """Act in the real source and fill D_source, which may hold fewer than ``n_steps`` transitions."""
+    assert model.env is not None  # learn() has checked
+    real = EpisodeSource(model.env)
+    model.source_timesteps += real.interact(model, min(n_steps, model.replay_buffer.source.buffer_size))
+    model.env.reset()
+
+
+def _fit_phi_0(model: Resumable, dynamics: Dynamics) -> None:
+    """Let the learned dynamics describe the source before the first target step (Algorithm 1's input)."""
+    for name, value in dynamics.fit(model.transitions("source"), max_steps=PHI_0_UPDATES).items():
+        model.logger.record(f"dynamics/phi_0_{name}", value)
+
+
+def _train_in_source(model: Resumable, source_timesteps: int, progress_bar: bool) -> None:
     """Plain SAC in the real source, one update per step; resumes where a checkpoint left it."""
     assert model.env is not None  # learn() has checked
     bar = None
@@ -123,7 +128,7 @@ def _train_in_source(model: TransferAlgorithm, source_timesteps: int, progress_b
     model.env.reset()
 
 
-def _report(model: TransferAlgorithm, source: EpisodeSource) -> None:
+def _report(model: Resumable, source: EpisodeSource) -> None:
     """Log the source phase in a group of its own and leave a checkpoint where the logger has a folder."""
     for name, value in {"timesteps": model._pretrained_steps, **source.log()}.items():
         model.logger.record(f"pretrain/{name}", value)
@@ -134,7 +139,7 @@ def _report(model: TransferAlgorithm, source: EpisodeSource) -> None:
         model.save_replay_buffer(folder / "pretrain_replay_buffer.pkl")
 
 
-def _carry_optimizers(sac: SAC, model: TransferAlgorithm) -> None:
+def _carry_optimizers(sac: SAC, model: Resumable) -> None:
     """Take over the temperature and the state of every optimiser."""
     pairs: list[tuple[Any, Any]] = [
         (sac.actor.optimizer, model.actor.optimizer),
@@ -149,7 +154,12 @@ def _carry_optimizers(sac: SAC, model: TransferAlgorithm) -> None:
         ours.load_state_dict(copy.deepcopy(theirs.state_dict()))
 
 
-def _checked(arrays: dict[str, np.ndarray], model: TransferAlgorithm, name: str) -> dict[str, np.ndarray]:
+def _checked(arrays: dict[str, np.ndarray], model: Resumable, name: str) -> dict[str, np.ndarray]:
+    """The recorded transitions, unless they are not of this model's environments.
+
+    :param name: of the argument that they were passed as
+    :raises ValueError: for other shapes and for actions that are not on the buffers' scale
+    """
     for array, space in (("observations", model.observation_space), ("actions", model.action_space)):
         if arrays[array].shape[1:] != space.shape:
             raise ValueError(
@@ -162,18 +172,7 @@ def _checked(arrays: dict[str, np.ndarray], model: TransferAlgorithm, name: str)
     return arrays
 
 
-def _fill_source(model: TransferAlgorithm, arrays: dict[str, np.ndarray]) -> None:
-    n = min(len(arrays["rewards"]), model.replay_buffer.source.buffer_size)
-    _append(model, "source", {name: array[-n:] for name, array in arrays.items()})
-    model.replay_buffer.source_starts = arrays["observations"].astype(model.observation_space.dtype)
-
-
-def _append(model: TransferAlgorithm, world: World, arrays: dict[str, np.ndarray]) -> None:
-    model.replay_buffer.append(
-        world,
-        arrays["observations"],
-        arrays["next_observations"],
-        arrays["actions"],
-        arrays["rewards"],
-        arrays["terminations"],
-    )
+def _append_newest(model: Resumable, world: World, arrays: dict[str, np.ndarray]) -> None:
+    """Add as many of the newest transitions as that side of the buffer holds."""
+    newest = {name: array[-model.replay_buffer.side(world).buffer_size :] for name, array in arrays.items()}
+    model.replay_buffer.append(world, dones=newest.pop("terminations"), **newest)

@@ -1,0 +1,124 @@
+"""What users pass, looked at before anything expensive; every error names the argument and the remedy."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Collection
+from typing import Any
+
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+
+from sb3_rpto.algorithms.bookkeeping import TwoWorlds
+from sb3_rpto.dynamics.factory import BACKENDS
+from sb3_rpto.dynamics.weights import WEIGHTINGS
+
+#: Arguments that only an algorithm with trainable dynamics has a use for.
+DYNAMICS_ARGUMENTS = frozenset(
+    {
+        "target_data",
+        "dynamics",
+        "dynamics_kwargs",
+        "declared",
+        "weighting",
+        "weight_floor",
+        "rollout_start",
+        "model_train_freq",
+    }
+)
+#: Goals, Dict observations and n-step returns (SB3's HerReplayBuffer is a DictReplayBuffer).
+UNSUPPORTED_BUFFERS = (DictReplayBuffer, NStepReplayBuffer)
+
+
+def check_supported(
+    n_steps: int, optimize_memory_usage: bool, replay_buffer_class: type[ReplayBuffer] | None, close_loop: bool
+) -> None:
+    """Refuse arguments of SAC's or ours that the algorithms are not written for.
+
+    :raises NotImplementedError: for n-step returns, overlapping storage, buffers of goals or Dicts, effect tracing
+    """
+    if n_steps != 1 or optimize_memory_usage:
+        raise NotImplementedError(
+            "n_steps > 1 and optimize_memory_usage=True are not supported (branches are one step): leave both out"
+        )
+    if isinstance(replay_buffer_class, type) and issubclass(replay_buffer_class, UNSUPPORTED_BUFFERS):
+        raise NotImplementedError(
+            f"replay_buffer_class={replay_buffer_class.__name__} is not supported; leave it out or pass a subclass of "
+            "ReplayBuffer for flat observations and single steps"
+        )
+    if close_loop:
+        raise NotImplementedError("close_loop=True needs the effect tracer, which this version does not have yet")
+
+
+def check_applicable(algorithm: str, updates_dynamics: bool, passed: Collection[str]) -> None:
+    """Refuse arguments that the algorithm has no use for.
+
+    :param algorithm: its name
+    :param updates_dynamics: whether it trains the source's dynamics
+    :param passed: names of the arguments that the user passed
+    :raises ValueError: naming those that do not apply
+    """
+    inapplicable = sorted(set() if updates_dynamics else DYNAMICS_ARGUMENTS & set(passed))
+    if inapplicable:
+        raise ValueError(f"{algorithm} does not use {inapplicable}; leave them out or use RPTO")
+
+
+def check_values(
+    *,
+    dynamics: str,
+    weighting: str | None,
+    rollout_start: str,
+    real_ratio: float,
+    weight_floor: float,
+    source_steps: Any,
+    model_train_freq: Any,
+) -> None:
+    """Refuse names that do not exist and numbers out of range; arguments as those of the algorithms.
+
+    :raises ValueError: naming the argument, its value and what it may be
+    """
+    for name, value, choices in (
+        ("dynamics", dynamics, BACKENDS),
+        ("weighting", weighting, (*WEIGHTINGS, None)),
+        ("rollout_start", rollout_start, ("target", "source", "mix")),
+    ):
+        if value not in choices:
+            raise ValueError(f"{name}={value!r} does not exist; choose one of {list(choices)}")
+    if not 0 <= real_ratio < 1:
+        raise ValueError(f"real_ratio must lie in [0, 1), got {real_ratio}")
+    if weight_floor < 0:
+        raise ValueError(f"weight_floor must not be negative, got {weight_floor}")
+    for name, value in (("source_steps", source_steps), ("model_train_freq", model_train_freq)):
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name} must be a positive integer, got {value!r}")
+
+
+def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | None) -> None:
+    """Refuse to learn without both worlds or with a budget that makes no sense; arguments as those of ``learn()``.
+
+    :raises ValueError: naming what is missing or wrong
+    """
+    if model.env is None:
+        raise ValueError("learn() needs the source environment: pass env= to load(), or call set_env()")
+    if model.target_env is None and not model._offline:
+        raise ValueError(
+            "learn() needs the target: pass target_env= (an environment to interact with) or target_data= "
+            "(recorded transitions, RTO and RPTO) to the constructor, or call set_target_env()"
+        )
+    if total_timesteps <= 0:
+        raise ValueError(f"total_timesteps must be positive, got {total_timesteps}")
+    if model.target_env is not None and total_timesteps < model.target_env.num_envs:
+        raise ValueError(
+            f"total_timesteps={total_timesteps} is less than one step of target_env's {model.target_env.num_envs} "
+            "environments; raise it or use fewer"
+        )
+    if source_timesteps is not None and source_timesteps < 0:
+        raise ValueError(f"source_timesteps must not be negative, got {source_timesteps}")
+    if model._offline and model.weighting is not None and not model.replay_buffer.target.rewards.any():
+        raise ValueError("target_data holds no rewards, which RTO's weight needs; pass weighting=None")
+    capacity = model.replay_buffer.target.buffer_size
+    if model.target_env is not None and total_timesteps > capacity:
+        warnings.warn(
+            f"D_target holds {capacity} transitions, fewer than the budget of {total_timesteps}; pass "
+            'replay_buffer_kwargs={"target_size": ...} to keep them all',
+            stacklevel=3,
+        )

@@ -1,0 +1,297 @@
+"""SB3's bookkeeping, kept for two worlds where SB3 knows one."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    ProgressBarCallback,
+    StopTrainingOnMaxEpisodes,
+)
+from stable_baselines3.common.noise import VectorizedActionNoise
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+
+from sb3_rpto.algorithms.snapshots import PolicySnapshots
+from sb3_rpto.algorithms.source import SourceWorld
+from sb3_rpto.algorithms.worlds import (
+    NullShiftCheck,
+    TargetLedger,
+    check_finite,
+    check_pair,
+    check_seedable,
+    find_ledger,
+    share_normalisation,
+)
+
+#: The target's random stream is the seed plus this, so that both worlds never draw the same numbers.
+TARGET_SEED_OFFSET = 10_000
+DYNAMICS_SEED_OFFSET = 20_000
+#: The policy with the highest mean return over this many consecutive target episodes is kept as the best.
+RECENT_EPISODES = 5
+#: What SB3's collection knows of a step when it calls back, before it stores the transition.
+STEP = ("buffer_actions", "new_obs", "rewards", "dones", "infos")
+
+
+class TwoWorlds(PolicySnapshots):
+    """The two environments, and SB3's accounts of a run: the source is SB3's ``env``, all accounts are the target's.
+
+    ``num_timesteps``, the last observation, episode statistics, action noise, callbacks and progress follow the target;
+    the source is stepped beside them and has counters and a log group of its own.
+    """
+
+    target_env: VecEnv | None
+    #: source transitions per target step; an integer once the preset is applied
+    source_steps: Any
+    #: source steps taken so far, in the real source or its model; in plain SAC there; target steps by purpose
+    source_timesteps: int
+    _pretrained_steps: int
+    target_spent: dict[str, int]
+
+    _last_obs: np.ndarray | None  # the target's; observations are flat Boxes, never a Dict
+    _last_original_obs: np.ndarray | None
+    _source_world: SourceWorld | None
+    #: the observation of SB3's reset of the source, where its first episode begins
+    _source_first_obs: np.ndarray | None
+    _null_check: NullShiftCheck | None
+    #: the run's callbacks while it lasts: they know the step that SB3 has taken and not yet stored
+    _callback: BaseCallback | None
+    #: where a loaded checkpoint left the worlds, until ``learn()`` puts them back
+    _resume_state: dict[str, Any] | None
+
+    # ------------------------------------------------------------------ the worlds
+
+    def set_target_env(self, env: GymEnv | str) -> None:
+        """Set the target; the next ``learn()`` starts a new episode there.
+
+        :param env: an environment, a VecEnv or an id
+        :raises ValueError: when it is the source itself, has other spaces, or cannot be reset with a seed
+        """
+        if isinstance(env, str):
+            env = gym.make(env)
+        check_seedable(env, "target_env")
+        venv = self._wrap_env(env, self.verbose)
+        if self.env is not None:
+            check_pair(self.env, venv)
+        self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
+        self._offline = False
+        self._last_obs = None
+        if self.seed is not None:
+            self.target_env.seed(self.seed + TARGET_SEED_OFFSET)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Set the source environment, as in SB3; the target keeps sharing its normalisation."""
+        last_obs = self._last_obs
+        super().set_env(env, force_reset)
+        self._last_obs = last_obs  # SB3 forgets the observation of what it takes to be the training env
+        self._source_world = None
+        if self.env is not None and self.target_env is not None:
+            check_pair(self.env, find_ledger(self.target_env))
+            self.target_env = share_normalisation(find_ledger(self.target_env), self.env)
+
+    def get_vec_normalize_env(self) -> VecNormalize | None:
+        """The source's VecNormalize, which learns the statistics, also while SB3 collects in the target."""
+        return None if self.env is None else unwrap_vec_normalize(self.env)
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed both worlds and the model, each with its own stream; with None nothing is seeded."""
+        super().set_random_seed(seed)
+        if seed is None:
+            return
+        if self.target_env is not None:
+            self.target_env.seed(seed + TARGET_SEED_OFFSET)
+        if self.dynamics is not None:
+            self.dynamics.seed(seed + DYNAMICS_SEED_OFFSET)
+
+    # ------------------------------------------------------------------ a run's start
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        """As SB3's, with the last observation and the action noise belonging to the target."""
+        starts_episode = reset_num_timesteps or self._last_obs is None
+        noise, self.action_noise = self.action_noise, None  # SB3 would size it by the source
+        total_timesteps, callback = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        self.action_noise = noise
+        if starts_episode:
+            self._source_world, self._source_first_obs = None, self._last_obs  # SB3 has just reset the source
+            if noise is not None and self._resume_state is None:
+                noise.reset()
+        if self._offline:
+            self._last_obs = np.zeros((1, *self.observation_space.shape), self.observation_space.dtype)  # never read
+        elif starts_episode:
+            self._start_target_episode()
+        return total_timesteps, callback
+
+    def _start_target_episode(self) -> None:
+        """Reset the target and what SB3 keeps of it."""
+        assert self.target_env is not None  # learn() has checked
+        n_envs, noise = self.target_env.num_envs, self.action_noise
+        if noise is not None and n_envs > 1 and not isinstance(noise, VectorizedActionNoise):
+            self.action_noise = VectorizedActionNoise(noise, n_envs)
+        self._last_obs = np.asarray(self.target_env.reset())
+        self._last_episode_starts = np.ones(n_envs, dtype=bool)
+        normaliser = unwrap_vec_normalize(self.target_env)
+        self._last_original_obs = None if normaliser is None else np.asarray(normaliser.get_original_obs())
+        check_finite("target", observation=self._last_obs)
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        """As SB3's, with what counts environments counting the target's, not the source's."""
+        judged_by, self.best_by = self.best_by, "training"
+        callbacks = super()._init_callback(callback, progress_bar)
+        if self.best_by != judged_by:  # by a callback, or no longer: the two measures cannot be compared
+            self.best_mean_reward = -np.inf
+        for item in _flatten(callbacks):
+            if isinstance(item, ProgressBarCallback):
+                item.__class__ = TargetProgressBar
+            elif isinstance(item, StopTrainingOnMaxEpisodes) and self.target_env is not None:
+                item._total_max_episodes = item.max_episodes * self.target_env.num_envs
+        return callbacks
+
+    def _watch_for_null_shift(self) -> None:
+        """Before the first target step: begin to compare the target with a copy of the source."""
+        if self.num_timesteps == 0 and not self._offline:
+            assert self.env is not None
+            assert self.target_env is not None  # learn() has checked
+            self._null_check = NullShiftCheck(self.env, find_ledger(self.target_env).venv)
+
+    # ------------------------------------------------------------------ steps
+
+    def _steps_left(self) -> int:
+        """Steps of the budget that can still be taken; 0 when fewer are left than the target has environments."""
+        left = self._total_timesteps - self.num_timesteps
+        width = 1 if self._offline or self.target_env is None else self.target_env.num_envs
+        return left if left >= width else 0
+
+    def _rollout_length(self) -> TrainFreq:
+        """``train_freq``, cut off where the budget ends."""
+        assert isinstance(self.train_freq, TrainFreq)  # SB3's setup has made it one
+        assert self.target_env is not None
+        steps_left = self._steps_left() // self.target_env.num_envs
+        if self.train_freq.unit == TrainFrequencyUnit.STEP:
+            return TrainFreq(min(self.train_freq.frequency, steps_left), TrainFrequencyUnit.STEP)
+        return cast(TrainFreq, EpisodesWithinBudget(self, self.train_freq.frequency, steps_left))
+
+    @contextmanager
+    def _targets_normalisation(self) -> Iterator[None]:
+        """Inside, ``_vec_normalize_env`` is the target's: SB3 reads a step's original observations from it."""
+        assert self.target_env is not None
+        kept, self._vec_normalize_env = self._vec_normalize_env, unwrap_vec_normalize(self.target_env)
+        try:
+            yield
+        finally:
+            self._vec_normalize_env = kept
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store a target transition as SB3 does, after a look at it."""
+        check_finite("target", observation=np.asarray(new_obs), reward=reward)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        assert self.target_env is not None
+        find_ledger(self.target_env).unstored = False
+        if self._null_check is not None:
+            self._compare_with_source(self._null_check, buffer_action, dones)
+        if self.updates_policy and self.best_by == "training" and any("episode" in info for info in infos):
+            self._judge_recent_episodes()
+
+    def _compare_with_source(self, check: NullShiftCheck, buffer_action: np.ndarray, dones: np.ndarray) -> None:
+        """Warn when the transition just stored is the last of many that the source would have answered alike."""
+        side = self.replay_buffer.target
+        answer = side.next_observations[(side.pos - len(dones)) % side.buffer_size, 0]
+        same = check.agrees(self.policy.unscale_action(buffer_action[:1]), answer, bool(dones[0]))
+        if same is not None:
+            self._null_check = None
+        if same:
+            warnings.warn(
+                "target_env has stepped exactly like env so far: is it the world you meant? (Nothing to transfer.)",
+                stacklevel=3,
+            )
+
+    def _judge_recent_episodes(self) -> None:
+        """Keep the policy as the best if the newest target episodes earned more than any before."""
+        assert self.ep_info_buffer is not None
+        recent = [info["r"] for info in list(self.ep_info_buffer)[-RECENT_EPISODES:]]
+        if len(recent) == RECENT_EPISODES:
+            self.keep_if_best(float(np.mean(recent)))
+
+    def store_step(self, step: dict[str, Any]) -> None:
+        """Finish a target step as SB3 does after its callback, where SB3 itself does not get to it.
+
+        :param step: the locals of SB3's collection that :data:`STEP` names
+        """
+        with self._targets_normalisation():
+            self._update_info_buffer(step["infos"], step["dones"])
+            self._store_transition(self.replay_buffer, *(step[name] for name in STEP))
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        for i in np.flatnonzero(step["dones"]):
+            self._episode_num += 1
+            if self.action_noise is not None:
+                self.action_noise.reset(**({"indices": [i]} if len(step["dones"]) > 1 else {}))
+
+    def _count_source_steps(self, callback: BaseCallback) -> bool:
+        """What stands in for a target step when the target is a log: ``num_timesteps`` counts source steps."""
+        self.num_timesteps += int(self.source_steps)
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        callback.update_locals(locals())
+        return callback.on_step()
+
+
+class EpisodesWithinBudget:
+    """Stands in for SB3's ``TrainFreq``: so many episodes, but not more steps than are left.
+
+    SB3's collection reads ``frequency`` before every step, so this may end it at the end of an episode although it
+    counts steps (which, unlike SB3's episodes, several environments can be counted in).
+
+    :param model: whose episodes are counted, from now on
+    :param n_episodes: episodes after which the collection ends
+    :param n_steps: steps (of all environments at once) after which it ends in any case
+    """
+
+    unit = TrainFrequencyUnit.STEP
+
+    def __init__(self, model: TwoWorlds, n_episodes: int, n_steps: int) -> None:
+        self._model = model
+        self._last_episode = model._episode_num + n_episodes
+        self._n_steps = n_steps
+
+    @property
+    def frequency(self) -> int:
+        """Steps of this collection as far as it is known."""
+        return self._n_steps if self._model._episode_num < self._last_episode else 0
+
+
+class TargetProgressBar(ProgressBarCallback):
+    """SB3's progress bar, advancing by the steps that count: those of ``num_timesteps``."""
+
+    def _on_step(self) -> bool:
+        self.pbar.update(self.model.num_timesteps - self.model._num_timesteps_at_start - self.pbar.n)
+        return True
+
+
+def _flatten(callback: BaseCallback) -> list[BaseCallback]:
+    """The single callbacks in nested lists."""
+    if isinstance(callback, CallbackList):
+        return [item for child in callback.callbacks for item in _flatten(child)]
+    return [callback]
