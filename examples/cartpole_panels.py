@@ -31,8 +31,8 @@ import sb3_rpto  # noqa: F401  (registers the environment)
 from sb3_rpto.experiments.report import iqm_interval, summarise
 from sb3_rpto.experiments.run import evaluate, transfer
 
-SAC_SETTINGS = {"policy_kwargs": {"net_arch": [64, 64]}, "learning_rate": 1e-3, "gamma": 0.995}
-SHIFTS = {"length 4 m": {"pole_length": 4.0}, "gravity 40 m/s2": {"gravity": 40.0}, "force 1.5 N": {"force_scale": 1.5}}
+SAC_SETTINGS = {"policy_kwargs": {"net_arch": [64, 64]}, "learning_rate": 1e-3, "gamma": 0.98, "tau": 0.01}
+SHIFTS = {"length 3 m": {"pole_length": 3.0}, "gravity 80 m/s2": {"gravity": 80.0}, "force 1 N": {"force_scale": 1.0}}
 METHODS = {
     "RPTO": ("rpto", {"dynamics": "physical"}),
     "RPO": ("rpo", {}),
@@ -40,6 +40,8 @@ METHODS = {
     "SAC-warm, 10 updates": ("sac-warm", {"gradient_steps": 10}),
     "SAC from scratch": ("sac", {**SAC_SETTINGS, "gradient_steps": 10}),
 }
+#: Mean return in the source at which the pole counts as standing: 500 is the most a perfect policy could get.
+STANDING = 490
 COLOURS = dict(zip(METHODS, ("C3", "C0", "C1", "C5", "C7")))
 
 
@@ -82,7 +84,7 @@ def source_policy(folder: Path, seed: int) -> str:
     for _ in range(25):
         model.learn(1_000, reset_num_timesteps=False)
         reached = evaluate(model, evaluation, 20, seed)
-        standing = standing + 1 if reached >= 500 else 0
+        standing = standing + 1 if reached >= STANDING else 0
         if reached >= best:
             best = reached
             model.save(path)
@@ -186,7 +188,7 @@ def main() -> None:
         seeds, budget, lengths, shifts = [0], 300, [1.2, 3.0], dict(list(SHIFTS.items())[:1])
         arguments.runs = arguments.runs / "quick"
     else:
-        seeds, budget, lengths, shifts = list(range(5)), 1000, [0.5, 0.8, 1.2, 1.6, 2.0, 3.0, 4.0, 5.0], SHIFTS
+        seeds, budget, lengths, shifts = list(range(5)), 800, [0.5, 1.2, 2.0, 3.0, 4.0, 5.0], SHIFTS
     out = arguments.out or (arguments.runs if arguments.quick else Path(__file__).parent / "results" / "cartpole")
     for folder in (arguments.runs, out):
         folder.mkdir(parents=True, exist_ok=True)

@@ -74,6 +74,9 @@ class EnsembleDynamics(Dynamics):
     :param max_steps: gradient steps a fit makes at most, unless it is told otherwise
     :param min_holdout_for_elites: holdout transitions from which on a fit ranks the members anew; below, the ranking is
         noise and the elites stay
+    :param noise: False answers every step by the elites' mean. While the target has shown little, the predicted
+        variance is doubt, not chance; sampled in an unstable world it ends branches that would go on and drags all
+        values down
     :raises ValueError: spaces that are not flat Boxes, or a number out of range
     """
 
@@ -103,6 +106,7 @@ class EnsembleDynamics(Dynamics):
         patience: int = 5,
         max_steps: int = 5000,
         min_holdout_for_elites: int = 100,
+        noise: bool = True,
     ) -> None:
         super().__init__(observation_space, action_space)
         for name, space in (("observation_space", observation_space), ("action_space", action_space)):
@@ -125,6 +129,7 @@ class EnsembleDynamics(Dynamics):
         self.patience = patience
         self.max_steps = max_steps
         self.min_holdout_for_elites = min_holdout_for_elites
+        self.noise = noise
         self.observation_dim, self.action_dim = observation_space.shape[0], action_space.shape[0]
         if termination_fn is None:
             warnings.warn(
@@ -157,7 +162,7 @@ class EnsembleDynamics(Dynamics):
         :param deterministic: the mean prediction instead of a sample
         """
         inputs = self._inputs(observations, actions)
-        if deterministic:
+        if deterministic or not self.noise:
             heads = self._ask_elites(inputs)
             targets, ended = heads.mean.mean(dim=0), heads.logit.sigmoid().mean(dim=0) > 0.5
         else:

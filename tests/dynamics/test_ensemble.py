@@ -602,3 +602,16 @@ def test_bad_arguments():
     for bad in ({"n_elites": 0}, {"n_elites": 9}, {"holdout_ratio": 0.0}, {"holdout_ratio": 0.6}, {"batch_size": 0}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             EnsembleDynamics(box, box, **bad)
+
+
+def test_without_noise_every_step_is_the_elites_mean():
+    data = linear(300)
+    model, quiet = make(), make(noise=False)
+    for each in (model, quiet):
+        each.fit(data, max_steps=20)
+    expected = model.step(data.observations, data.actions, deterministic=True)
+    answer = quiet.step(data.observations, data.actions)
+    th.testing.assert_close(answer.next_observations, expected.next_observations)
+    assert not th.allclose(
+        model.step(data.observations, data.actions).next_observations, expected.next_observations, atol=1e-3
+    )
