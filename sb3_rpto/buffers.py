@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pathlib
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -37,7 +38,7 @@ class DualReplayBuffer(ReplayBuffer):
     :param n_envs: ignored (each side accepts any number of rows at a time); SB3 passes it
     :param optimize_memory_usage: refused: branches are not trajectories, so their next observations must be stored
     :param handle_timeout_termination: as in SB3
-    :param target_size: capacity of the target side, by default the smaller of ``buffer_size`` and 200,000
+    :param target_size: capacity of the target side
     :param side_class: the replay buffer class of each side
     :param side_kwargs: further arguments of each side's constructor
     :raises NotImplementedError: for ``optimize_memory_usage=True``
@@ -53,7 +54,7 @@ class DualReplayBuffer(ReplayBuffer):
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
         *,
-        target_size: int | None = None,
+        target_size: int = TARGET_CAPACITY,
         side_class: type[ReplayBuffer] = ReplayBuffer,
         side_kwargs: dict[str, Any] | None = None,
     ) -> None:
@@ -63,9 +64,9 @@ class DualReplayBuffer(ReplayBuffer):
                 "leave it False and lower buffer_size to save memory"
             )
         kwargs = {"handle_timeout_termination": handle_timeout_termination, **(side_kwargs or {})}
-        target_size = min(buffer_size, TARGET_CAPACITY) if target_size is None else target_size
-        self.source = side_class(buffer_size, observation_space, action_space, device=device, **kwargs)
-        self.target = side_class(target_size, observation_space, action_space, device=device, **kwargs)
+        self._make_side = partial(side_class, observation_space=observation_space, action_space=action_space, **kwargs)
+        self.source = self._make_side(buffer_size, device=device)
+        self.target = self._make_side(target_size, device=device)
         #: observations of the real source environment, from which model branches may start; (n, observation_dim)
         self.source_starts = np.empty((0, *observation_space.shape), dtype=observation_space.dtype)
         # BaseBuffer alone: ReplayBuffer's constructor would allocate a third set of arrays.
@@ -129,6 +130,18 @@ class DualReplayBuffer(ReplayBuffer):
         """Add one target step of any number of environments; arguments as in SB3."""
         timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
         self.append("target", obs, next_obs, action, reward, done, timeouts)
+
+    def resize_source(self, capacity: int) -> None:
+        """Give the source side another capacity; the newest transitions that fit are kept.
+
+        :param capacity: in transitions
+        """
+        if capacity == self.source.buffer_size:
+            return
+        kept = {name: array[-capacity:] for name, array in chronological(self.source).items()}
+        self.source = self._make_side(capacity, device=self.device)
+        if len(kept["rewards"]) > 0:
+            self.append("source", dones=kept.pop("terminations"), **kept)
 
     def append(
         self,

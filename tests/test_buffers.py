@@ -107,6 +107,19 @@ def test_pickle_keeps_both_worlds_and_the_device_is_settable():
     assert copy.target.dones[0, 0] == 1
 
 
+def test_resizing_the_source_keeps_the_newest():
+    buffer = DualReplayBuffer(8, OBS, ACT, device="cpu")
+    buffer.append("source", **rows(0, 6))
+    before = chronological(buffer.source)
+    buffer.resize_source(50)
+    for name, array in chronological(buffer.source).items():
+        assert array.tolist() == before[name].tolist(), name
+    buffer.append("source", **rows(6, 20))
+    buffer.resize_source(5)
+    assert chronological(buffer.source)["rewards"].tolist() == [21, 22, 23, 24, 25]
+    assert buffer.source.buffer_size == 5
+
+
 def test_bad_input():
     with pytest.raises(NotImplementedError, match="optimize_memory_usage"):
         DualReplayBuffer(10, OBS, ACT, optimize_memory_usage=True)
