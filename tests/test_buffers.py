@@ -46,7 +46,8 @@ def test_worlds_stay_apart():
 
 
 def test_sampling_equals_an_sb3_buffer_with_the_same_contents():
-    ours, theirs = DualReplayBuffer(50, OBS, ACT, device="cpu"), ReplayBuffer(50, OBS, ACT, device="cpu")
+    ours = DualReplayBuffer(10, OBS, ACT, device="cpu", target_size=50)
+    theirs = ReplayBuffer(50, OBS, ACT, device="cpu")
     data = rows(0, 70)
     ours.append("target", **data)
     for i in range(70):
