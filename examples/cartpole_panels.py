@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import warnings
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from importlib.metadata import version
@@ -130,8 +129,6 @@ def _estimate(model) -> dict[str, float]:
 
 
 def _prepare_worker() -> None:
-    warnings.filterwarnings("ignore", message="Evaluation environment is not wrapped")
-    warnings.filterwarnings("ignore", message="You are probably loading")
     th.set_num_threads(1)
     th.set_float32_matmul_precision("medium")
 

@@ -65,8 +65,8 @@ class DualReplayBuffer(ReplayBuffer):
             )
         kwargs = {"handle_timeout_termination": handle_timeout_termination, **(side_kwargs or {})}
         self._make_side = partial(side_class, observation_space=observation_space, action_space=action_space, **kwargs)
-        self.source = self._make_side(buffer_size, device=device)
-        self.target = self._make_side(target_size, device=device)
+        self.source = self._make_side(buffer_size=buffer_size, device=device)
+        self.target = self._make_side(buffer_size=target_size, device=device)
         #: observations of the real source environment, from which model branches may start; (n, observation_dim)
         self.source_starts = np.empty((0, *observation_space.shape), dtype=observation_space.dtype)
         # BaseBuffer alone: ReplayBuffer's constructor would allocate a third set of arrays.
@@ -139,7 +139,7 @@ class DualReplayBuffer(ReplayBuffer):
         if capacity == self.source.buffer_size:
             return
         kept = {name: array[-capacity:] for name, array in chronological(self.source).items()}
-        self.source = self._make_side(capacity, device=self.device)
+        self.source = self._make_side(buffer_size=capacity, device=self.device)
         if len(kept["rewards"]) > 0:
             self.append("source", dones=kept.pop("terminations"), **kept)
 
@@ -209,36 +209,44 @@ def chronological(side: ReplayBuffer) -> dict[str, np.ndarray]:
     return {**flat, "terminations": terminations}
 
 
-def load_transitions(data: ReplayBuffer | str | pathlib.Path | io.BufferedIOBase) -> dict[str, np.ndarray]:
+def load_transitions(
+    data: ReplayBuffer | str | pathlib.Path | io.BufferedIOBase, rewards_optional: bool = False
+) -> dict[str, np.ndarray]:
     """Read transitions from an SB3 replay buffer, its pickle, or an ``.npz`` file.
 
     The ``.npz`` form holds ``obs``, ``act`` (scaled to [-1, 1]), ``next_obs``, ``rew`` and ``done`` (terminal, not a
     time limit). Of a :class:`DualReplayBuffer` the source side is read.
 
+    :param data: where they are
+    :param rewards_optional: whether an ``.npz`` may lack ``rew``; the result then has no ``rewards``
     :return: the arrays of :func:`chronological`
     :raises ValueError: for a file with other contents, an empty set or values that are not finite
     """
     if isinstance(data, str | pathlib.Path) and str(data).endswith(".npz"):
-        names = {
-            "observations": "obs",
-            "next_observations": "next_obs",
-            "actions": "act",
-            "rewards": "rew",
-            "terminations": "done",
-        }
-        with np.load(data) as file:
-            missing = sorted(set(names.values()) - set(file.files))
-            if missing:
-                raise ValueError(f"{data} lacks the arrays {missing}; expected obs, act, next_obs, rew, done")
-            arrays = {name: file[key] for name, key in names.items()}
+        arrays = _load_npz(data, rewards_optional)
     else:
         buffer = data if isinstance(data, ReplayBuffer) else load_from_pkl(data)
         if not isinstance(buffer, ReplayBuffer):
             raise ValueError(f"expected an SB3 ReplayBuffer, its pickle or an .npz file, got {type(buffer).__name__}")
         arrays = chronological(buffer.source if isinstance(buffer, DualReplayBuffer) else buffer)
-    if len(arrays["rewards"]) == 0:
+    if len(arrays["observations"]) == 0:
         raise ValueError("the transitions to load are empty")
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"{name} of the loaded transitions hold NaN or infinite values; remove those rows")
     return arrays
+
+
+def _load_npz(path: str | pathlib.Path, rewards_optional: bool) -> dict[str, np.ndarray]:
+    names = {
+        "observations": "obs",
+        "next_observations": "next_obs",
+        "actions": "act",
+        "rewards": "rew",
+        "terminations": "done",
+    }
+    with np.load(path) as file:
+        missing = set(names.values()) - set(file.files)
+        if missing - ({"rew"} if rewards_optional else set()):
+            raise ValueError(f"{path} lacks the arrays {sorted(missing)}; expected obs, act, next_obs, rew, done")
+        return {name: file[key] for name, key in names.items() if key in file.files}

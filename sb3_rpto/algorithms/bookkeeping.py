@@ -31,6 +31,7 @@ from sb3_rpto.algorithms.worlds import (
     find_ledger,
     share_normalisation,
 )
+from sb3_rpto.envs.rules import task_rules
 
 #: The target's random stream is the seed plus this, so that both worlds never draw the same numbers.
 TARGET_SEED_OFFSET = 10_000
@@ -55,6 +56,10 @@ class TwoWorlds(PolicySnapshots):
     source_timesteps: int
     _pretrained_steps: int
     target_spent: dict[str, int]
+
+    #: what rebuilds the dynamics, and the user's part of it
+    dynamics_config: dict[str, Any] | None
+    dynamics_kwargs: dict[str, Any]
 
     _last_obs: np.ndarray | None  # the target's; observations are flat Boxes, never a Dict
     _last_original_obs: np.ndarray | None
@@ -86,6 +91,21 @@ class TwoWorlds(PolicySnapshots):
         self._last_obs = None
         if self.seed is not None:
             self.target_env.seed(self.seed + TARGET_SEED_OFFSET)
+
+    def _adopt_target_rules(self) -> None:
+        """Hopper's healthy heights follow its body, say: phi_0 knew the source's rules, phi shall know the target's.
+
+        Rules that the user passed stay, and so does a rule that the target does not tell.
+        """
+        config = self.dynamics_config
+        if config is None or "termination_fn" not in config or self.target_env is None:
+            return
+        rules = task_rules(find_ledger(self.target_env).venv)
+        for name in ("reward_fn", "termination_fn"):
+            rule = getattr(rules, name)
+            if rule is not None and name not in self.dynamics_kwargs and config[name] is not None:
+                config[name] = rule  # what a checkpoint rebuilds the model from
+                setattr(self.dynamics, name, rule)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Set the source environment, as in SB3; the target keeps sharing its normalisation."""

@@ -124,6 +124,10 @@ class TransferAlgorithm(Resumable):
         if env is not None:  # SB3's load() builds the object before it has an env
             check_spaces(env.observation_space, env.action_space)
             check_seedable(env, "env")
+        if target_env is not None and target_data is not None:
+            raise ValueError(
+                "target_env and target_data exclude each other: interact with the target or use a log of it"
+            )
         arguments.check_supported(n_steps, optimize_memory_usage, replay_buffer_class, close_loop)
         super().__init__(
             policy,
@@ -170,7 +174,7 @@ class TransferAlgorithm(Resumable):
         self.target_spent = {}
         self.source_timesteps = 0
         self.dynamics = None
-        self.dynamics_config: dict[str, Any] | None = None
+        self.dynamics_config = None
         self.snapshots = {}
         self.best_mean_reward = -np.inf
         self._offline = target_data is not None
@@ -199,6 +203,7 @@ class TransferAlgorithm(Resumable):
                 self.set_target_env(target_env)
             if target_data is not None:
                 warm.fill_target(self, target_data)
+                self._since_fit = self.model_train_freq  # all data are there: the first fit need not wait
 
     # ------------------------------------------------------------------ setting up
 
@@ -207,7 +212,8 @@ class TransferAlgorithm(Resumable):
         backend = self.dynamics_backend if self.updates_dynamics else "real"
         spec = None if self.env is None else self.env.get_attr("spec", indices=[0])[0]
         env_id = spec.id if spec else None
-        for name, value in resolve_preset(self.preset, backend, env_id, self._passed - {"dynamics_kwargs"}).items():
+        passed = self._passed - {"dynamics_kwargs"} - ({"source_steps"} if self.source_steps == "auto" else set())
+        for name, value in resolve_preset(self.preset, backend, env_id, passed).items():
             if name == "dynamics_kwargs":
                 value = {**value, **self.dynamics_kwargs}
             setattr(self, name, value)
@@ -262,8 +268,7 @@ class TransferAlgorithm(Resumable):
         :param kwargs: constructor arguments; they win over the source model's and the preset's
         :raises ValueError: when the source model's spaces are not the environment's
         """
-        device = kwargs.get("device", "auto")
-        sac = source_model if isinstance(source_model, SAC) else SAC.load(source_model, device=device)
+        sac = warm.load_sac(source_model, kwargs.get("device", "auto"))
         settings = {**warm.carried_arguments(sac), **kwargs}
         model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **settings)
         warm.carry_over(sac, model)

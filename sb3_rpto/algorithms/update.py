@@ -102,6 +102,7 @@ class RelativeUpdate(SAC):
             return
         self._since_fit = 0
         assert self.dynamics is not None
+        self._adopt_target_rules()
         self.policy.set_training_mode(False)  # values for the weights: no dropout, no new batch statistics
         data = self.transitions("target")
         self.logger.record("dynamics/error_before", self.dynamics.error(data))
@@ -122,6 +123,9 @@ class RelativeUpdate(SAC):
         self.logger.record("dynamics/error", self.dynamics.error(data))
         if self._offline:  # SB3 writes its logs at the end of target episodes; there are none
             self.dump_logs()
+
+    def _adopt_target_rules(self) -> None:
+        """From the first fit on the model is one of the target: let what is known of the task be the target's."""
 
     def sample_batches(self, batch_size: int) -> tuple[ReplayBufferSamples, ReplayBufferSamples]:
         """A batch for the critic, mostly of D_source, and one for the actor, alternating between the worlds.

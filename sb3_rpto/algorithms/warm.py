@@ -12,8 +12,10 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.algorithms.source import EpisodeSource
+from sb3_rpto.algorithms.update import as_transitions
 from sb3_rpto.buffers import World, load_transitions
 from sb3_rpto.dynamics.base import Dynamics
+from sb3_rpto.envs.rules import task_rules
 
 #: Source steps that fit phi_0 when no source data are given, and the cap of gradient steps of that fit.
 PHI_0_STEPS, PHI_0_UPDATES = 25_000, 5_000
@@ -27,6 +29,22 @@ def carried_arguments(sac: SAC) -> dict[str, Any]:
     """Constructor arguments that a warm start takes over from the source model."""
     policy_kwargs = {name: value for name, value in sac.policy_kwargs.items() if name != "use_sde"}
     return {**{name: getattr(sac, name) for name in CARRIED}, "policy_kwargs": policy_kwargs}
+
+
+def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
+    """The source model itself, or from its zip.
+
+    :raises ValueError: for a zip that SAC cannot load
+    """
+    if isinstance(source_model, SAC):
+        return source_model
+    try:
+        return SAC.load(source_model, device=device)
+    except (KeyError, ValueError) as error:
+        raise ValueError(
+            f"source_model={str(source_model)!r} is not the zip of a SAC ({error}); a model of this package goes on "
+            "with its own class's load()"
+        ) from error
 
 
 def carry_over(sac: SAC, model: Resumable) -> None:
@@ -49,43 +67,52 @@ def carry_over(sac: SAC, model: Resumable) -> None:
 def fill_source(model: Resumable, source_data: ReplayBuffer | str | pathlib.Path) -> None:
     """Put recorded source transitions into D_source; branches may start from their states."""
     arrays = _checked(load_transitions(source_data), model, "source_data")
+    model.replay_buffer.resize_source(max(model.buffer_size, len(arrays["rewards"])))
     _append_newest(model, "source", arrays)
     model.replay_buffer.source_starts = arrays["observations"].astype(model.observation_space.dtype)
 
 
 def fill_target(model: Resumable, target_data: ReplayBuffer | str | pathlib.Path) -> None:
-    """Put recorded target transitions into D_target."""
-    _append_newest(model, "target", _checked(load_transitions(target_data), model, "target_data"))
+    """Put recorded target transitions into D_target; rewards that were not recorded come from the task's reward_fn."""
+    arrays = _checked(load_transitions(target_data, rewards_optional=True), model, "target_data")
+    if "rewards" not in arrays:
+        arrays["rewards"] = _rewards(model, arrays)
+    _append_newest(model, "target", arrays)
 
 
 def begin_in_source(model: Resumable, source_timesteps: int, progress_bar: bool) -> None:
     """Bring policy, D_source and phi_0 to where Algorithm 1 starts; counts no target step.
 
     A model that knows nothing of the source first trains there by plain SAC. D_source then holds source transitions,
-    and phi_0 is fitted to them.
+    and phi_0 is fitted to them. While all this goes on D_source is as large as it takes; the transfer begins with the
+    newest ``buffer_size`` of them.
     """
+    buffer = model.replay_buffer
     if not model._warm and source_timesteps > 0:
+        buffer.resize_source(max(buffer.source.buffer_size, source_timesteps))
         _train_in_source(model, source_timesteps, progress_bar)
     model._warm = True
     if not model.snapshots:
         model.take_snapshot("source")
     # A network must be fitted to describe the source; a physical model comes with the source's constants.
     learned = model.dynamics if model.dynamics is not None and model.dynamics.rollout == "branches" else None
-    if len(model.replay_buffer.source_starts) == 0:  # neither source_data nor an earlier run gave any
+    if len(buffer.source_starts) == 0:  # neither source_data nor an earlier run gave any
+        wanted = PHI_0_STEPS if learned is not None else min(FIRST_SOURCE_STEPS, model.buffer_size)
+        buffer.resize_source(max(buffer.source.buffer_size, wanted))
+        _collect_in_source(model, wanted - buffer.source.size())
         if learned is not None:
-            _collect_in_source(model, PHI_0_STEPS)
-            model.replay_buffer.source_starts = model.transitions("source").observations.cpu().numpy()[-PHI_0_STEPS:]
-        elif model.replay_buffer.source.size() == 0:
-            _collect_in_source(model, FIRST_SOURCE_STEPS)
+            buffer.source_starts = model.transitions("source").observations.cpu().numpy()[-PHI_0_STEPS:]
     if learned is not None and not learned.fitted:
         _fit_phi_0(model, learned)
+    buffer.resize_source(model.buffer_size)
 
 
 def _collect_in_source(model: Resumable, n_steps: int) -> None:
-    """Act in the real source and fill D_source, which may hold fewer than ``n_steps`` transitions."""
+    """Act in the real source and fill D_source; nothing for ``n_steps`` <= 0."""
     assert model.env is not None  # learn() has checked
-    real = EpisodeSource(model.env)
-    model.source_timesteps += real.interact(model, min(n_steps, model.replay_buffer.source.buffer_size))
+    if n_steps <= 0:
+        return
+    model.source_timesteps += EpisodeSource(model.env).interact(model, n_steps)
     model.env.reset()
 
 
@@ -170,6 +197,22 @@ def _checked(arrays: dict[str, np.ndarray], model: Resumable, name: str) -> dict
             f"{name} holds actions outside [-1, 1]; scale them by policy.scale_action, as SB3's buffers do"
         )
     return arrays
+
+
+def _rewards(model: Resumable, arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """Rewards (n,) of recorded transitions by the reward function that was passed or is known of the task.
+
+    :raises ValueError: when there is none
+    """
+    assert model.env is not None  # target_data is an argument of the constructor, which has one
+    reward_fn = model.dynamics_kwargs.get("reward_fn") or task_rules(model.env).reward_fn
+    if reward_fn is None:
+        raise ValueError(
+            "target_data holds no rewards and the task's are not known; record them (rew) or pass "
+            "dynamics_kwargs={'reward_fn': f} with f(observations, actions, next_observations) -> (n,)"
+        )
+    data = as_transitions({**arrays, "rewards": arrays["terminations"]}, model.policy, model.device)
+    return reward_fn(data.observations, data.actions, data.next_observations).cpu().numpy()
 
 
 def _append_newest(model: Resumable, world: World, arrays: dict[str, np.ndarray]) -> None:

@@ -127,7 +127,7 @@ class ContinuousCartPoleEnv(gym.Env[np.ndarray, np.ndarray]):
     """Balance a pole on a cart by a continuous force.
 
     Observations are [position (m), velocity (m/s), angle from upright (rad), angular velocity (rad/s)], actions a share
-    in [-1, 1] of ``force_scale`` (values outside are clipped), the reward is at most 1 a step (:func:`cartpole_reward`).
+    in [-1, 1] of ``force_scale`` (values outside are clipped), rewards at most 1 a step: :func:`cartpole_reward`.
     With the default constants and actions of ±1 it moves and ends exactly as gymnasium's CartPole-v1. See
     :func:`cartpole_step` for the equations.
 

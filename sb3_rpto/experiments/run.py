@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import pathlib
 import time
 from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -123,11 +123,7 @@ def transfer(
     elif method == "sac":
         model = SAC("MlpPolicy", make_target(), seed=seed, device="cpu", **kwargs)
     else:
-        model = SAC.load(source_model, env=make_target(), device="cpu")
-        model.set_random_seed(seed)
-        model.learning_starts = 0
-        for name, value in kwargs.items():
-            setattr(model, name, value)
+        model = fine_tuned_sac(source_model, make_target(), seed, **kwargs)
     if method == "zero-shot":
         curve._updates_at_start = model._n_updates
         curve.evaluate(model, 0)
@@ -137,7 +133,15 @@ def transfer(
     return [{"method": method, "seed": seed, **row} for row in curve.rows]
 
 
-def transitions_to_reach(rows: list[dict[str, Any]], threshold: float) -> float:
-    """The fewest evaluated target steps at which a run's return is at least ``threshold``; infinite if never."""
-    reached = [row["steps"] for row in rows if row["return"] >= threshold]
-    return float(min(reached)) if reached else np.inf
+def fine_tuned_sac(source_model: str | pathlib.Path, target: gym.Env, seed: int, **settings: Any) -> SAC:
+    """SAC-warm: the source's SAC, ready to go on in the target from its first step, with an empty replay buffer.
+
+    :param source_model: zip of the SAC that was trained in the source
+    :param target: the target
+    :param seed: of the run
+    :param settings: attributes to change, e.g. ``gradient_steps``
+    """
+    model = SAC.load(source_model, env=target, device="cpu", **settings)
+    model.set_random_seed(seed)
+    model.learning_starts = 0
+    return model

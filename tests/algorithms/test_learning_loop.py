@@ -5,6 +5,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from conftest import ALGORITHMS, SMALL_ENSEMBLE, pendulum, small
 from gymnasium import spaces
 from stable_baselines3 import SAC
@@ -199,7 +200,7 @@ def test_vec_normalize_statistics_are_the_sources_alone():
     assert shared.obs_rms is source.obs_rms
     assert not shared.training
     counted = source.obs_rms.count
-    assert counted == pytest.approx(model._pretrained_steps + 300 + 3 * 2, abs=12)
+    assert counted == pytest.approx(300 + 3 * 2, abs=12)  # what phi_0 is fitted to, the source phase's steps among it
     speeds = chronological(model.replay_buffer.target)["observations"][:, :2]
     np.testing.assert_allclose((speeds**2).sum(1), 1.0, atol=1e-5)  # cos, sin: stored raw
     model.set_env(VecNormalize(make_vec_env(pendulum, n_envs=2, seed=1)))
@@ -331,8 +332,50 @@ def test_offline_data_stand_in_for_the_target(tmp_path):
     assert 400 <= model.num_timesteps < 420
     assert model.replay_buffer.size() == 300
     assert model._n_updates == 40
+    assert model.logger.name_to_value["dynamics/error"] > 0  # fitted in the first round already
     with pytest.raises(ValueError, match="RPO does not use"):
         RPO("MlpPolicy", pendulum(), target_data=recorder.replay_buffer)
+    with pytest.raises(ValueError, match="exclude each other"):
+        RPTO("MlpPolicy", pendulum(), target_env=pendulum(12.0), target_data=recorder.replay_buffer)
+
+
+def test_rewards_that_a_log_lacks_come_from_the_tasks_reward_function(tmp_path):
+    recorder = SAC("MlpPolicy", pendulum(12.0), policy_kwargs={"net_arch": [16]}, learning_starts=50, seed=0).learn(50)
+    log = chronological(recorder.replay_buffer)
+    arrays = {"obs": "observations", "act": "actions", "next_obs": "next_observations", "done": "terminations"}
+    np.savez(tmp_path / "log.npz", **{key: log[name] for key, name in arrays.items()})
+    model = RPTO("MlpPolicy", pendulum(), target_data=tmp_path / "log.npz", dynamics_kwargs=SMALL_ENSEMBLE)
+    np.testing.assert_allclose(chronological(model.replay_buffer.target)["rewards"], log["rewards"], atol=1e-4)
+    unknown = make_vec_env(lambda: CountingPendulum(pendulum()), n_envs=1)
+    with pytest.raises(ValueError, match="reward_fn"):
+        RPTO("MlpPolicy", unknown, target_data=tmp_path / "log.npz", dynamics_kwargs=SMALL_ENSEMBLE)
+
+
+def test_source_steps_auto_is_the_presets_number():
+    assert RPTO("MlpPolicy", pendulum(), source_steps="auto").source_steps == 400
+
+
+def test_from_the_first_fit_on_the_rules_are_the_targets():
+    def hopper(lowest):
+        return gym.make("Hopper-v5", healthy_z_range=(lowest, float("inf")))
+
+    model = small(RPTO, hopper(0.7), hopper(0.9))
+    rows = th.zeros(1, 11)
+    rows[0, 0] = 0.8  # the torso's height
+    action = th.zeros(1, 3)
+    assert not model.dynamics.termination_fn(rows, action, rows).any()
+    model.learn(60, source_timesteps=0)
+    assert model.dynamics.termination_fn(rows, action, rows).all()
+
+
+def test_the_source_phase_keeps_more_than_the_transfer_does():
+    model = small(RPO, buffer_size=40)
+    model.learn(3, source_timesteps=90)
+    assert model.replay_buffer.source.size() == 40
+    assert model._pretrained_steps == 90
+    model = small(RPTO, buffer_size=40)
+    model.learn(3, source_timesteps=90)
+    assert len(model.replay_buffer.source_starts) == 300  # the phase's 90 and as many more as phi_0 wants
 
 
 @pytest.mark.parametrize("cls", [RTO, RPTO])
