@@ -26,6 +26,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_rpto import RPTO
 from sb3_rpto.algorithms.update import as_transitions
 from sb3_rpto.buffers import chronological
+from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.experiments.run import LearningCurve, fine_tuned_sac
 
 #: Mean return in the source at which the policy counts as converged: 9,360 is the most there is.
@@ -58,12 +59,9 @@ def source_policy(folder: Path, seed: int) -> tuple[Path, Path]:
     return model_path, data_path
 
 
-def held_out(model: SAC, n_steps: int, seed: int) -> Any:
-    """Target transitions of the source policy that no method has seen; they measure the model, nothing learns on them."""
-    recorder = SAC.load(model, env=target(), device="cpu") if not isinstance(model, SAC) else model
-    recorder.set_random_seed(seed)
-    recorder.learning_starts, recorder.gradient_steps = 0, 0
-    recorder.learn(n_steps)
+def held_out(model_path: Path, n_steps: int, seed: int) -> Transitions:
+    """Target transitions of the source policy that nothing learns from; they measure the model."""
+    recorder = fine_tuned_sac(model_path, target(), seed, gradient_steps=0).learn(n_steps)
     return as_transitions(chronological(recorder.replay_buffer), recorder.policy, recorder.device)
 
 
@@ -104,7 +102,7 @@ def main() -> None:
     rival_curve = LearningCurve(target, every, n_episodes=5, seed=arguments.seed)
     rival.learn(arguments.steps, callback=rival_curve)
 
-    unseen = held_out(SAC.load(model_path, env=target(), device="cpu"), 300, seed=arguments.seed + 1)
+    unseen = held_out(model_path, 300, seed=arguments.seed + 1)
     error_after = model.dynamics.error(unseen)
     model.dynamics.load_state_dict(phi_0)
     error_before = model.dynamics.error(unseen)
