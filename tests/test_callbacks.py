@@ -305,7 +305,7 @@ def test_other_algorithms_are_refused(callback):
 def test_newest_episodes_finds_all_that_are_whole(lengths, n_steps, capacity, n_episodes):
     n_envs = len(lengths)
     space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
-    dual = DualReplayBuffer(capacity, space, Decay.action_space, device="cpu")
+    dual = DualReplayBuffer(capacity, space, Decay.action_space, device="cpu", target_size=capacity)
     # each observation is unique: (environment and episode, time)
     clock = [(0, 0)] * n_envs
     episodes = []

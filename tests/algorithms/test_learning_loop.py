@@ -323,6 +323,7 @@ def test_offline_data_stand_in_for_the_target(tmp_path):
         policy_kwargs={"net_arch": [16]},
         dynamics_kwargs=SMALL_ENSEMBLE,
         model_train_freq=20,
+        gradient_steps=1,
         source_steps=10,
         batch_size=32,
         seed=0,

@@ -88,7 +88,7 @@ def build(cls, env=None, target=None, policy="MlpPolicy", **kwargs):
     settings |= {"seed": 0, "device": "cpu", **kwargs}
     if cls is SAC:
         return SAC(policy, env, **settings)
-    own = {"source_steps": 4}
+    own = {"source_steps": 4, "gradient_steps": 1}
     if cls.updates_dynamics:
         network = {"hidden": (8,), "n_members": 2, "n_elites": 1, "max_steps": 5}
         own |= {"dynamics_kwargs": network, "model_train_freq": 15}

@@ -1,0 +1,81 @@
+"""What is refused before anything is built, each check by itself."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import ALGORITHMS, small
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer
+
+from sb3_rpto.algorithms import arguments
+
+VALUES = {
+    "dynamics": "ensemble",
+    "weighting": "paper",
+    "rollout_start": "mix",
+    "real_ratio": 0.05,
+    "weight_floor": 0.5,
+    "source_steps": 20,
+    "model_train_freq": 250,
+}
+
+
+class Matrix(gym.Env):
+    """Two rows of actions."""
+
+    observation_space = spaces.Box(-1, 1, (3,), np.float32)
+    action_space = spaces.Box(-1, 1, (2, 2), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(3, np.float32), {}
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_actions_that_are_not_flat_are_refused_at_construction(cls):
+    with pytest.raises(NotImplementedError, match=r"shape \(2, 2\).*TransformAction"):
+        small(cls, Matrix(), Matrix())
+
+
+def test_what_is_allowed_passes():
+    arguments.check_values(**VALUES)
+    arguments.check_supported(1, False, None, False)
+    arguments.check_applicable("RPO", False, {"env", "real_ratio"})
+    arguments.check_applicable("RPTO", True, arguments.DYNAMICS_ARGUMENTS)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("dynamics", "gp"),
+        ("weighting", "centered"),
+        ("rollout_start", "middle"),
+        ("real_ratio", 1.0),
+        ("real_ratio", -0.1),
+        ("weight_floor", -1e-9),
+        ("source_steps", "auto"),
+        ("source_steps", 0),
+        ("model_train_freq", 2.5),
+    ],
+)
+def test_a_wrong_value_is_named(name, value):
+    with pytest.raises(ValueError, match=f"^{name}"):
+        arguments.check_values(**{**VALUES, name: value})
+
+
+@pytest.mark.parametrize(
+    ("passed", "named"),
+    [
+        ((3, False, None, False), "n_steps"),
+        ((1, True, None, False), "optimize_memory_usage"),
+        ((1, False, DictReplayBuffer, False), "replay_buffer_class=DictReplayBuffer"),
+        ((1, False, None, True), "close_loop"),
+    ],
+)
+def test_what_is_not_supported_is_named(passed, named):
+    with pytest.raises(NotImplementedError, match=named):
+        arguments.check_supported(*passed)
+
+
+def test_arguments_without_use_are_named():
+    with pytest.raises(ValueError, match=r"RPO does not use \['declared', 'weighting'\]"):
+        arguments.check_applicable("RPO", False, {"env", "weighting", "declared"})

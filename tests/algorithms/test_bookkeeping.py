@@ -1,0 +1,77 @@
+"""SB3's accounts in the target: rollouts of whole episodes, the null-shift check."""
+
+import gymnasium as gym
+import pytest
+from conftest import ALGORITHMS, small
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_rpto import RPO
+
+
+def short(g=12.0):
+    return gym.make("Pendulum-v1", g=g, max_episode_steps=8)
+
+
+class Watch(BaseCallback):
+    """The gSDE noise at every step, and when rollouts begin and end."""
+
+    def __init__(self):
+        super().__init__()
+        self.noise, self.events = [], []
+
+    def _on_rollout_start(self):
+        self.events.append(("start", self.num_timesteps))
+
+    def _on_rollout_end(self):
+        self.events.append(("end", self.num_timesteps))
+
+    def _on_step(self):
+        if self.model.use_sde:
+            self.noise.append(self.model.actor.action_dist.exploration_mat[0, 0].item())
+        return True
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize(("sample_freq", "redrawn"), [(-1, 1), (4, 2)])
+def test_exploration_noise_lasts_in_episodic_training(cls, sample_freq, redrawn):
+    model = small(cls, short(10.0), short(), train_freq=(1, "episode"), use_sde=True, sde_sample_freq=sample_freq)
+    watch = Watch()
+    model.learn(16, callback=watch, source_timesteps=0)
+    assert [len(set(watch.noise[i : i + 8])) for i in (0, 8)] == [redrawn, redrawn]
+    assert len(set(watch.noise)) == 2 * redrawn
+
+
+def test_a_rollout_is_as_many_episodes_as_train_freq_says_within_the_budget():
+    model = small(RPO, short(10.0), short(), train_freq=(2, "episode"))
+    watch = Watch()
+    model.learn(37, callback=watch, source_timesteps=0)
+    assert watch.events == [("start", 0), ("end", 16), ("start", 16), ("end", 32), ("start", 32), ("end", 37)]
+    assert model.target_spent == {"learning": 37}
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_a_resumed_source_phase_still_notices_a_target_equal_to_the_source(cls, tmp_path):
+    # unseeded: the loaded model's own reset begins elsewhere than the saved target stands
+    model = small(cls, short(10.0), short(10.0), seed=None, learning_starts=0)
+    saved = tmp_path / "model.zip"
+
+    class SaveBeforeTheFirstStep(BaseCallback):
+        def _on_training_start(self):
+            self.model.save(saved)
+            self.model.save_replay_buffer(tmp_path / "buffer.pkl")
+
+        def _on_step(self):
+            return True
+
+    with pytest.warns(UserWarning, match="stepped exactly like env"):
+        model.learn(20, callback=SaveBeforeTheFirstStep(), source_timesteps=40)
+    resumed = cls.load(saved, env=short(10.0), target_env=short(10.0))
+    resumed.load_replay_buffer(tmp_path / "buffer.pkl")
+    with pytest.warns(UserWarning, match="stepped exactly like env"):
+        resumed.learn(20, reset_num_timesteps=False)
+
+
+def test_the_null_shift_check_ends():
+    model = small(RPO, short(10.0), short(12.0))
+    model.learn(3, source_timesteps=0)
+    assert model._null_check is None
