@@ -56,6 +56,8 @@ class Dynamics(nn.Module, ABC):
     rollout: ClassVar[Literal["branches", "episodes"]]
 
     optimizer: th.optim.Optimizer
+    #: a backend with branches: false until phi_0 is fitted to the source
+    fitted: th.Tensor
 
     def __init__(self, observation_space: spaces.Box, action_space: spaces.Box) -> None:
         super().__init__()
