@@ -210,14 +210,15 @@ def chronological(side: ReplayBuffer) -> dict[str, np.ndarray]:
 
 
 def load_transitions(
-    data: ReplayBuffer | str | pathlib.Path | io.BufferedIOBase, rewards_optional: bool = False
+    data: ReplayBuffer | str | pathlib.Path | io.BufferedIOBase, world: World = "source", rewards_optional: bool = False
 ) -> dict[str, np.ndarray]:
     """Read transitions from an SB3 replay buffer, its pickle, or an ``.npz`` file.
 
     The ``.npz`` form holds ``obs``, ``act`` (scaled to [-1, 1]), ``next_obs``, ``rew`` and ``done`` (terminal, not a
-    time limit). Of a :class:`DualReplayBuffer` the source side is read.
+    time limit).
 
     :param data: where they are
+    :param world: the side that is read of a :class:`DualReplayBuffer`
     :param rewards_optional: whether an ``.npz`` may lack ``rew``; the result then has no ``rewards``
     :return: the arrays of :func:`chronological`
     :raises ValueError: for a file with other contents, an empty set or values that are not finite
@@ -228,7 +229,7 @@ def load_transitions(
         buffer = data if isinstance(data, ReplayBuffer) else load_from_pkl(data)
         if not isinstance(buffer, ReplayBuffer):
             raise ValueError(f"expected an SB3 ReplayBuffer, its pickle or an .npz file, got {type(buffer).__name__}")
-        arrays = chronological(buffer.source if isinstance(buffer, DualReplayBuffer) else buffer)
+        arrays = chronological(buffer.side(world) if isinstance(buffer, DualReplayBuffer) else buffer)
     if len(arrays["observations"]) == 0:
         raise ValueError("the transitions to load are empty")
     for name, array in arrays.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection
+from numbers import Integral
 from typing import Any
 
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
@@ -49,6 +50,15 @@ def check_supported(
         raise NotImplementedError("close_loop=True needs the effect tracer, which this version does not have yet")
 
 
+def check_one_target(target_env: Any, target_data: Any) -> None:
+    """Refuse a target environment and a log of it at once.
+
+    :raises ValueError: when both are given
+    """
+    if target_env is not None and target_data is not None:
+        raise ValueError("target_env and target_data exclude each other: pass the target or a log of it")
+
+
 def check_applicable(algorithm: str, updates_dynamics: bool, passed: Collection[str]) -> None:
     """Refuse arguments that the algorithm has no use for.
 
@@ -71,6 +81,8 @@ def check_values(
     weight_floor: float,
     source_steps: Any,
     model_train_freq: Any,
+    batch_size: Any,
+    buffer_size: Any,
 ) -> None:
     """Refuse names that do not exist and numbers out of range; arguments as those of the algorithms.
 
@@ -87,8 +99,9 @@ def check_values(
         raise ValueError(f"real_ratio must lie in [0, 1), got {real_ratio}")
     if weight_floor < 0:
         raise ValueError(f"weight_floor must not be negative, got {weight_floor}")
-    for name, value in (("source_steps", source_steps), ("model_train_freq", model_train_freq)):
-        if not isinstance(value, int) or value < 1:
+    positive = {"source_steps": source_steps, "model_train_freq": model_train_freq}
+    for name, value in {**positive, "batch_size": batch_size, "buffer_size": buffer_size}.items():
+        if not _is_integer(value) or value < 1:
             raise ValueError(f"{name} must be a positive integer, got {value!r}")
 
 
@@ -104,15 +117,15 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
             "learn() needs the target: pass target_env= (an environment to interact with) or target_data= "
             "(recorded transitions, RTO and RPTO) to the constructor, or call set_target_env()"
         )
-    if total_timesteps <= 0:
-        raise ValueError(f"total_timesteps must be positive, got {total_timesteps}")
+    if not _is_integer(total_timesteps) or total_timesteps <= 0:
+        raise ValueError(f"total_timesteps must be a positive integer, got {total_timesteps!r}")
     if model.target_env is not None and total_timesteps < model.target_env.num_envs:
         raise ValueError(
             f"total_timesteps={total_timesteps} is less than one step of target_env's {model.target_env.num_envs} "
             "environments; raise it or use fewer"
         )
-    if source_timesteps is not None and source_timesteps < 0:
-        raise ValueError(f"source_timesteps must not be negative, got {source_timesteps}")
+    if source_timesteps is not None and (not _is_integer(source_timesteps) or source_timesteps < 0):
+        raise ValueError(f"source_timesteps must be an integer and not negative, got {source_timesteps!r}")
     if model._offline and model.weighting is not None and not model.replay_buffer.target.rewards.any():
         raise ValueError("target_data holds no rewards, which RTO's weight needs; pass weighting=None")
     capacity = model.replay_buffer.target.buffer_size
@@ -122,3 +135,7 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
             'replay_buffer_kwargs={"target_size": ...} to keep them all',
             stacklevel=3,
         )
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)

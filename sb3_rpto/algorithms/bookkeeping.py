@@ -272,7 +272,7 @@ class TwoWorlds(PolicySnapshots):
 
     def _count_source_steps(self, callback: BaseCallback) -> bool:
         """What stands in for a target step when the target is a log: ``num_timesteps`` counts source steps."""
-        self.num_timesteps += int(self.source_steps)
+        self.num_timesteps += min(int(self.source_steps), self._steps_left())
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         callback.update_locals(locals())
         return callback.on_step()

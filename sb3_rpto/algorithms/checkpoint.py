@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_rpto.algorithms.bookkeeping import STEP, TwoWorlds
 from sb3_rpto.algorithms.worlds import find_ledger
@@ -51,11 +51,12 @@ class Resumable(TwoWorlds):
         """Save all that a resumed run needs, except the replay buffers (``save_replay_buffer``); atomic for paths."""
         if self.target_env is not None:  # a callback may save in the middle of a rollout
             self.target_spent = dict(find_ledger(self.target_env).spent)
-        self._resume_state = self._resume_state or capture(self)
+        loaded = self._resume_state  # a loaded model that has not learned since stands where it was saved first
+        self._resume_state = loaded or capture(self)
         try:
             write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
         finally:
-            self._resume_state = None
+            self._resume_state = loaded
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Save both replay buffers as one pickle; atomic for paths."""
@@ -162,18 +163,15 @@ def resume(model: Resumable) -> bool:
         return False
     assert model.env is not None  # learn() has checked both worlds
     restarted, inside = [], False
-    if state["source"] is None:
+    if not _put_back(model.env, state["source"]):
         restarted.append("source")
-    else:
-        restore_state(model.env, state["source"])
-        if state["source_world"] is not None and model._source_world is not None:
-            model._source_world.set_state(state["source_world"])
+    elif state["source_world"] is not None and model._source_world is not None:
+        model._source_world.set_state(state["source_world"])
     if not model._offline:
-        if state["target"] is None or state["last_obs"] is None:
+        assert model.target_env is not None
+        if state["last_obs"] is None or not _put_back(find_ledger(model.target_env).venv, state["target"]):
             restarted.append("target")
         else:
-            assert model.target_env is not None
-            restore_state(find_ledger(model.target_env).venv, state["target"])
             model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
             if state["unstored_step"] is not None:
                 inside = True
@@ -184,13 +182,25 @@ def resume(model: Resumable) -> bool:
     if restarted:
         warnings.warn(
             f"the {' and the '.join(restarted)} environment cannot restore its state: it begins a new episode, "
-            "so the resumed run differs from one that never stopped",
+            "so the resumed run differs from one that never stopped (it can where the environment is built as it was "
+            "when the checkpoint was saved, and can save its state)",
             stacklevel=3,
         )
     random.setstate(state["random"])
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
     return inside
+
+
+def _put_back(env: VecEnv, state: dict[str, Any] | None) -> bool:
+    """Restore a world; False, with nothing changed, without a state or with one of a world that is built otherwise."""
+    if state is None:
+        return False
+    try:
+        restore_state(env, state)
+    except ValueError:
+        return False
+    return True
 
 
 def write_atomically(path: Any, write: Callable[[Any], None], suffix: str = "zip") -> None:

@@ -163,6 +163,7 @@ class BranchSource(SourceWorld):
         answer = self.dynamics.step(th.as_tensor(starts, device=model.device), actions, deterministic=False)
         next_obs, rewards = answer.next_observations.cpu().numpy(), answer.rewards.cpu().numpy()
         check_finite("modelled source", observation=next_obs, reward=rewards)
+        next_obs = next_obs.clip(model.observation_space.low, model.observation_space.high)
         terminations = answer.terminations.cpu().numpy()
         model.replay_buffer.append("source", starts, next_obs, scaled.cpu().numpy(), rewards, terminations)
         return n_steps

@@ -124,10 +124,7 @@ class TransferAlgorithm(Resumable):
         if env is not None:  # SB3's load() builds the object before it has an env
             check_spaces(env.observation_space, env.action_space)
             check_seedable(env, "env")
-        if target_env is not None and target_data is not None:
-            raise ValueError(
-                "target_env and target_data exclude each other: interact with the target or use a log of it"
-            )
+        arguments.check_one_target(target_env, target_data)
         arguments.check_supported(n_steps, optimize_memory_usage, replay_buffer_class, close_loop)
         super().__init__(
             policy,
@@ -228,6 +225,8 @@ class TransferAlgorithm(Resumable):
             weight_floor=self.weight_floor,
             source_steps=self.source_steps,
             model_train_freq=self.model_train_freq,
+            batch_size=self.batch_size,
+            buffer_size=self.buffer_size,
         )
 
     def _setup_model(self) -> None:
@@ -335,7 +334,10 @@ class TransferAlgorithm(Resumable):
         if self.use_sde:
             self.actor.reset_noise()
         assert self._source_world is not None  # learn() has made it
-        self.source_timesteps += self._source_world.interact(self, self._collected * int(self.source_steps))
+        n_steps = self._collected * int(self.source_steps)
+        if self._offline:  # the budget is one of source steps then
+            n_steps = min(n_steps, self._steps_left())
+        self.source_timesteps += self._source_world.interact(self, n_steps)
 
     def interact_with_target(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Step 4: act in the target and fill D_target; SB3's own code collects, within the budget.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pathlib
+import warnings
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,10 @@ PHI_0_STEPS, PHI_0_UPDATES = 25_000, 5_000
 #: Source steps that fill D_source before the first target step when nothing else did.
 FIRST_SOURCE_STEPS = 5_000
 #: What a warm start takes over from the source model, unless the user passes it.
-CARRIED = ("learning_rate", "batch_size", "tau", "gamma", "ent_coef", "target_entropy", "use_sde", "sde_sample_freq")
+CARRIED = (
+    *("learning_rate", "batch_size", "tau", "gamma", "ent_coef", "target_entropy", "target_update_interval"),
+    *("use_sde", "sde_sample_freq", "use_sde_at_warmup"),
+)
 
 
 def carried_arguments(sac: SAC) -> dict[str, Any]:
@@ -56,6 +60,12 @@ def carry_over(sac: SAC, model: Resumable) -> None:
         ours, theirs = getattr(model, name), getattr(sac, name)
         if ours.shape != theirs.shape:
             raise ValueError(f"source_model has {name} {theirs}, env has {ours}; pass the agent of this environment")
+    if sac.action_space != model.action_space:
+        warnings.warn(
+            f"source_model was trained with {sac.action_space}, env has {model.action_space}: the same output of the "
+            "policy is another action now",
+            stacklevel=3,
+        )
     try:
         model.policy.load_state_dict(sac.policy.state_dict())
     except RuntimeError as error:
@@ -74,7 +84,7 @@ def fill_source(model: Resumable, source_data: ReplayBuffer | str | pathlib.Path
 
 def fill_target(model: Resumable, target_data: ReplayBuffer | str | pathlib.Path) -> None:
     """Put recorded target transitions into D_target; rewards that were not recorded come from the task's reward_fn."""
-    arrays = _checked(load_transitions(target_data, rewards_optional=True), model, "target_data")
+    arrays = _checked(load_transitions(target_data, "target", rewards_optional=True), model, "target_data")
     if "rewards" not in arrays:
         arrays["rewards"] = _rewards(model, arrays)
     _append_newest(model, "target", arrays)
@@ -187,11 +197,15 @@ def _checked(arrays: dict[str, np.ndarray], model: Resumable, name: str) -> dict
     :param name: of the argument that they were passed as
     :raises ValueError: for other shapes and for actions that are not on the buffers' scale
     """
-    for array, space in (("observations", model.observation_space), ("actions", model.action_space)):
-        if arrays[array].shape[1:] != space.shape:
+    of_observation, of_action = model.observation_space.shape, model.action_space.shape
+    expected = {"observations": of_observation, "next_observations": of_observation, "actions": of_action}
+    for array, values in arrays.items():
+        if values.shape[1:] != expected.get(array, ()):
             raise ValueError(
-                f"{name} holds {array} of shape {arrays[array].shape[1:]}, the environment's is {space.shape}"
+                f"{name} holds {array} of shape {values.shape[1:]}, the environment's is {expected.get(array, ())}"
             )
+        if len(values) != len(arrays["observations"]):
+            raise ValueError(f"{name} holds {len(values)} {array} and {len(arrays['observations'])} observations")
     if np.abs(arrays["actions"]).max() > 1 + 1e-3:
         raise ValueError(
             f"{name} holds actions outside [-1, 1]; scale them by policy.scale_action, as SB3's buffers do"

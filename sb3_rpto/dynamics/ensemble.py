@@ -52,8 +52,8 @@ class EnsembleDynamics(Dynamics):
 
     The scaler of inputs and targets is fitted by the first :meth:`fit` (the source data of phi_0) and then kept: were
     it refitted, phi would jump before its first gradient step. All losses are in its units, hence comparable over a
-    run. A holdout transition never becomes a training one: the split depends on nothing but the transition's
-    index.
+    run. While the data only grow a holdout transition never becomes a training one: the split depends on its index
+    alone.
 
     Patience, snapshots and elites go by the squared error on the holdout, not by the likelihood: that is MBPO's choice
     and gives the better means, but with few transitions the predicted variances become too small (``holdout_nll`` then

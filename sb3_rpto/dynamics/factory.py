@@ -34,7 +34,14 @@ def dynamics_config(backend: str, env: VecEnv, kwargs: dict[str, Any], declared:
         known = {"reward_fn": rules.reward_fn, "termination_fn": rules.termination_fn}
         return {"backend": backend, **known, **kwargs}
     if backend == "physical":
-        config = {"backend": backend, "constants": cartpole_constants(env), **kwargs}
+        try:
+            constants = cartpole_constants(env)
+        except ValueError as error:
+            raise ValueError(
+                "dynamics='physical' simulates ContinuousCartPole alone in this version, env is another; "
+                "use dynamics='ensemble'"
+            ) from error
+        config = {"backend": backend, "constants": constants, **kwargs}
         return {**config, "declared": tuple(declared)} if declared else config
     raise ValueError(f"dynamics={backend!r} does not exist; choose one of {list(BACKENDS)}")
 
@@ -43,4 +50,9 @@ def make_dynamics(config: dict[str, Any], observation_space: spaces.Box, action_
     """Build the model that :func:`dynamics_config` described."""
     arguments = dict(config)
     classes: dict[str, Any] = {"ensemble": EnsembleDynamics, "physical": PhysicalDynamics}
-    return classes[arguments.pop("backend")](observation_space, action_space, **arguments)
+    try:
+        return classes[arguments.pop("backend")](observation_space, action_space, **arguments)
+    except TypeError as error:
+        raise ValueError(
+            f"dynamics_kwargs: {error}; see {classes[config['backend']].__name__} for what there is"
+        ) from error

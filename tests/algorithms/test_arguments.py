@@ -17,6 +17,8 @@ VALUES = {
     "weight_floor": 0.5,
     "source_steps": 20,
     "model_train_freq": 250,
+    "batch_size": 256,
+    "buffer_size": 1_000,
 }
 
 

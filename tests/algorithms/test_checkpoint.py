@@ -100,6 +100,34 @@ def test_resuming_equals_not_having_stopped(case, tmp_path):
 
 
 @pytest.mark.parametrize("cls", ALGORITHMS)
+def test_saving_a_loaded_model_again_keeps_where_it_stood(cls, tmp_path):
+    def resumed(name):
+        model = cls.load(tmp_path / name, env=pendulum(), target_env=pendulum(12.0), device="cpu")
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+        return model
+
+    model = small(cls).learn(50, source_timesteps=0)
+    model.save(tmp_path / "first.zip")
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    again = resumed("first.zip")
+    again.save(tmp_path / "second.zip")
+    runs = [resumed("first.zip"), again, resumed("second.zip")]
+    for run in runs:
+        run.learn(30, reset_num_timesteps=False)
+    assert_same(runs[0], runs[1])
+    assert_same(runs[0], runs[2])
+
+
+def test_a_world_that_is_built_otherwise_begins_a_new_episode(tmp_path):
+    small(RPO).learn(30, source_timesteps=0).save(tmp_path / "model.zip")
+    wrapped = gym.wrappers.RescaleAction(pendulum(12.0), -2.0, 2.0)
+    model = RPO.load(tmp_path / "model.zip", env=pendulum(), target_env=wrapped)
+    with pytest.warns(UserWarning, match="target environment cannot restore"):
+        model.learn(10, reset_num_timesteps=False)
+    assert model.num_timesteps == 40
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
 def test_a_checkpoint_alone_can_predict(cls, tmp_path):
     model = small(cls).learn(60, source_timesteps=0)
     model.save(tmp_path / "model.zip")
@@ -262,6 +290,12 @@ def test_a_source_model_that_does_not_fit_is_refused(tmp_path):
     ).learn(20)
     with pytest.raises(ValueError, match="source_data holds observations"):
         RPTO.from_source(sac, pendulum(), pendulum(12.0), source_data=short.replay_buffer)
+
+
+def test_other_action_bounds_are_pointed_out():
+    sac = SAC("MlpPolicy", gym.wrappers.RescaleAction(pendulum(), -1.0, 1.0), policy_kwargs=SMALL_POLICY)
+    with pytest.warns(UserWarning, match="another action"):
+        RPO.from_source(sac, pendulum(), target_env=pendulum(12.0))
 
 
 def test_parameters_set_by_hand_count_as_a_warm_start():

@@ -278,6 +278,14 @@ def test_bad_input_is_refused_at_construction():
         small(RPTO, rollout_start="middle")
     with pytest.raises(ValueError, match="dynamics"):
         RPTO("MlpPolicy", env, dynamics="gp")
+    with pytest.raises(ValueError, match="batch_size"):
+        small(RPO, batch_size=0)
+    with pytest.raises(ValueError, match="buffer_size"):
+        small(RPO, buffer_size=0)
+    with pytest.raises(ValueError, match="dynamics_kwargs"):
+        small(RPTO, dynamics_kwargs={"foo": 1})
+    with pytest.raises(ValueError, match="dynamics='ensemble'"):
+        small(RPTO, dynamics="physical")
     with pytest.raises(ValueError, match="real_ratio"):
         small(RPTO, real_ratio=1.5)
     with pytest.raises(ValueError, match="weight_floor"):
@@ -295,7 +303,7 @@ def test_bad_input_is_refused_at_construction():
 def test_bad_input_is_refused_before_learning():
     with pytest.raises(ValueError, match="target_env="):
         RPO("MlpPolicy", pendulum()).learn(10)
-    for budget in (0, -5):
+    for budget in (0, -5, 1.5, float("nan"), True, "many"):
         with pytest.raises(ValueError, match="total_timesteps"):
             small(RPO).learn(budget)
     with pytest.raises(ValueError, match="source_timesteps"):
@@ -338,13 +346,43 @@ def test_offline_data_stand_in_for_the_target(tmp_path):
     model.dynamics.fit = watched
     model.learn(400, source_timesteps=0)
     assert fits == [0, 1, 21]  # phi_0; then in the first round, when all data are there already; then every 20
-    assert 400 <= model.num_timesteps < 420
+    assert model.num_timesteps == 400
     assert model.replay_buffer.size() == 300
     assert model._n_updates == 40
     with pytest.raises(ValueError, match="RPO does not use"):
         RPO("MlpPolicy", pendulum(), target_data=recorder.replay_buffer)
     with pytest.raises(ValueError, match="exclude each other"):
         RPTO("MlpPolicy", pendulum(), target_env=pendulum(12.0), target_data=recorder.replay_buffer)
+
+
+def test_a_dual_buffer_as_target_data_means_its_target_side(tmp_path):
+    recorded = small(RTO).learn(60, source_timesteps=0)
+    recorded.save_replay_buffer(tmp_path / "buffer.pkl")
+    log = chronological(recorded.replay_buffer.target)["observations"]
+    for data in (recorded.replay_buffer, tmp_path / "buffer.pkl"):
+        model = RTO("MlpPolicy", pendulum(), target_data=data, dynamics_kwargs=SMALL_ENSEMBLE)
+        np.testing.assert_array_equal(chronological(model.replay_buffer.target)["observations"], log)
+
+
+def test_the_budget_of_source_steps_is_not_exceeded():
+    data = small(RTO).learn(60, source_timesteps=0).replay_buffer
+    model = RTO("MlpPolicy", pendulum(), target_data=data, dynamics_kwargs=SMALL_ENSEMBLE, source_steps=40)
+    model.learn(100, source_timesteps=0)
+    assert model.num_timesteps == 100
+
+
+@pytest.mark.parametrize("change", ["next_obs", "rew", "rew2d"])
+def test_a_log_with_arrays_of_other_shapes_is_refused(change, tmp_path):
+    arrays = {name: np.zeros((20, 3), np.float32) for name in ("obs", "next_obs")}
+    arrays |= {"act": np.zeros((20, 1), np.float32), "rew": np.ones(20), "done": np.zeros(20)}
+    arrays |= {
+        "next_obs": {"next_obs": np.zeros((20, 2))},
+        "rew": {"rew": np.ones(9)},
+        "rew2d": {"rew": np.ones((20, 2))},
+    }[change]
+    np.savez(tmp_path / "log.npz", **arrays)
+    with pytest.raises(ValueError, match="target_data holds"):
+        RTO("MlpPolicy", pendulum(), target_data=tmp_path / "log.npz", dynamics_kwargs=SMALL_ENSEMBLE)
 
 
 def test_rewards_that_a_log_lacks_come_from_the_tasks_reward_function(tmp_path):
