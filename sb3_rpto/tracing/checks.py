@@ -1,0 +1,122 @@
+"""What can be wrong with one recorded run: pure functions on arrays, each of which repairs or reports one thing."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+MIN_ROWS = 5
+"""Fewest samples of a run: a cubic needs four points, one more leaves something to smooth."""
+GAP = 5.0
+"""A step in time longer than this many median steps is a gap."""
+JITTER = 0.05
+"""Time is called jittered when 5 % of the steps are off the median by more than this fraction of it."""
+SLOPE = (0.8, 1.25)
+"""Slopes of measured velocity against differentiated position that pass for one."""
+WINDOW = 9
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something about the data that a reader of the results must know.
+
+    :param kind: one of a few fixed words, e.g. ``"gap"`` or ``"wrapped angle"``
+    :param where: the episode and, where there is one, the column
+    :param message: what was found and what was done about it, in plain language
+    """
+
+    kind: str
+    where: str
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.kind} in {self.where}: {self.message}"
+
+
+def split_at_gaps(time: np.ndarray) -> list[slice]:
+    """Cut a run where its clock jumps.
+
+    :param time: increasing times in s, shape (T,)
+    :return: adjoining slices that together cover all T samples, in order
+    """
+    if len(time) < 2:
+        return [slice(0, len(time))]
+    steps = np.diff(time)
+    cuts = np.flatnonzero(steps > GAP * np.median(steps)) + 1
+    edges = [0, *cuts.tolist(), len(time)]
+    return [slice(start, stop) for start, stop in pairwise(edges)]
+
+
+def jitter(time: np.ndarray) -> float:
+    """Relative jitter of the clock: 95 % of the steps lie within this fraction of the median step.
+
+    :param time: increasing times in s, shape (T,) with T >= 2
+    """
+    steps = np.diff(time)
+    median = float(np.median(steps))
+    return float(np.quantile(np.abs(steps - median), 0.95)) / median
+
+
+def unwrap(angle: np.ndarray) -> tuple[np.ndarray, int]:
+    """Undo the wrapping of an angle to one turn.
+
+    Only a signal that stays within one turn (and 1 % for rounding) and jumps by nearly a whole one (within a quarter
+    turn) is taken as wrapped.
+
+    :param angle: in rad, shape (T,)
+    :return: the continuous angle, shape (T,), and the number of jumps removed
+    """
+    turn = 2 * np.pi
+    steps = np.diff(angle)
+    jumps = np.where(np.abs(np.abs(steps) - turn) < turn / 4, np.sign(steps), 0.0)
+    count = int(np.count_nonzero(jumps))
+    if count == 0 or np.ptp(angle) > 1.01 * turn:
+        return angle, 0
+    return angle - turn * np.concatenate([[0.0], np.cumsum(jumps)]), count
+
+
+def smoothed_velocity(time: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Differentiate a position on the run's own clock with a cubic Savitzky-Golay filter.
+
+    Position and time are both differentiated by sample number, and dq/dt = (dq/di) / (dt/di): so a jittered clock
+    counts with its true times and nothing is resampled.
+
+    :param time: increasing times in s, shape (T,) with T >= 5
+    :param position: in rad or m, shape (T,)
+    :return: velocity in rad/s or m/s, shape (T,)
+    """
+    window = min(WINDOW, len(time) - (len(time) + 1) % 2)
+    return savgol_filter(position, window, 3, deriv=1) / savgol_filter(time, window, 3, deriv=1)
+
+
+def quantum(velocity: np.ndarray) -> float | None:
+    """Smallest step of a coarsely quantised signal, None when the signal is not quantised.
+
+    Quantised means: fewer than half of the samples away from zero are distinct (zeros alone are a machine at rest).
+
+    :param velocity: shape (T,)
+    """
+    moving = velocity[velocity != 0]
+    levels = np.unique(velocity)
+    if len(moving) < 20 or len(levels) < 3 or 2 * len(np.unique(moving)) >= len(moving):
+        return None
+    steps = np.diff(levels)
+    # Levels that differ by rounding alone are one level.
+    return float(steps[steps > 1e-9 * np.ptp(levels)].min())
+
+
+def velocity_slope(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> float | None:
+    """Least-squares slope, through the origin, of a measured velocity against the differentiated position.
+
+    :param time: increasing times in s, shape (T,)
+    :param position: shape (T,)
+    :param velocity: shape (T,)
+    :return: 1 for consistent channels, negative for a flipped sign; None where the joint hardly moved against its noise
+    """
+    # Third differences remove the motion and scale white noise by sqrt(1 + 9 + 9 + 1).
+    noise = float(np.std(np.diff(position, 3))) / np.sqrt(20)
+    if np.ptp(position) <= 50 * noise or np.ptp(position) < 1e-9:
+        return None
+    reference = smoothed_velocity(time, position)
+    return float(reference @ velocity / (reference @ reference))

@@ -1,0 +1,99 @@
+"""The columns of a table of measurements: which are there, what they stand for, in which order they are kept."""
+
+import difflib
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+PLAIN = ("episode", "time", "split")
+PREFIXES = ("qpos", "qvel", "ctrl", "qfrc", "enabled", "param")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Names, without their prefix, of what a table holds.
+
+    :param qpos: positions, joint by joint in the order of the table; ``root.0`` to ``root.6`` for a free joint
+    :param qvel: velocities in the order of the joints; a scalar joint without a column is listed all the same
+    :param ctrl: actuators
+    :param qfrc: joints whose generalised force was measured
+    :param params: settings that differ by run, ``object.parameter``
+    :param missing: those of ``qvel`` that have no column and must be estimated
+    """
+
+    qpos: tuple[str, ...]
+    qvel: tuple[str, ...]
+    ctrl: tuple[str, ...]
+    qfrc: tuple[str, ...]
+    params: tuple[str, ...]
+    missing: tuple[str, ...]
+
+
+def joint_of(name: str) -> str:
+    """Joint of a coordinate: ``root`` for ``root.3``, the name itself for a scalar joint."""
+    return re.sub(r"\.\d$", "", name)
+
+
+def read_columns(names: Iterable[str], file: str) -> Columns:
+    """Sort the columns of one table by what they stand for.
+
+    :param names: all column names of the table
+    :param file: the table's name, for the messages
+    :raises ValueError: unknown, doubled or missing columns
+    """
+    names = list(names)
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled:
+        raise ValueError(f"{file}: column {doubled[0]!r} is there twice; rename or remove one")
+    found: dict[str, list[str]] = {prefix: [] for prefix in PREFIXES}
+    for name in names:
+        prefix, _, rest = name.partition(".")
+        if prefix in found and rest:
+            found[prefix].append(rest)
+        elif name not in PLAIN:
+            raise ValueError(f"{file}: unknown column {name!r}; {_near(name)}")
+    if "time" not in names:
+        raise ValueError(f"{file}: no column 'time'; add the time of each sample in seconds")
+    if not found["qpos"]:
+        raise ValueError(f"{file}: no column 'qpos.<joint>'; add the measured position of at least one joint")
+
+    joints = list(dict.fromkeys(joint_of(name) for name in found["qpos"]))
+    velocities: list[str] = []
+    missing: list[str] = []
+    for joint in joints:
+        qpos = _coordinates(joint, found["qpos"])
+        qvel = _coordinates(joint, found["qvel"])
+        if qpos == [joint]:
+            missing += [] if qvel else [joint]
+            qvel = qvel or [joint]
+        sizes = (1, 1) if qpos == [joint] else {4: (4, 3), 7: (7, 6)}.get(len(qpos), (0, 0))
+        if (len(qpos), len(qvel)) != sizes or (len(qvel) == 1) != (qvel == [joint]):
+            raise ValueError(
+                f"{file}: joint {joint!r} has {len(qpos)} qpos and {len(qvel)} qvel columns; "
+                f"give 'qpos.{joint}' for a scalar joint, "
+                f"4 and 3 numbered ones ('qpos.{joint}.0' …) for a ball joint, 7 and 6 for a free joint"
+            )
+        velocities += qvel
+    for prefix, known in (("qvel", velocities), ("qfrc", velocities), ("enabled", found["ctrl"])):
+        for name in found[prefix]:
+            if name not in known:
+                needed = "ctrl" if prefix == "enabled" else "qpos"
+                raise ValueError(
+                    f"{file}: column '{prefix}.{name}' has no '{needed}.{name}'; add it or correct the name"
+                )
+    positions = [name for joint in joints for name in _coordinates(joint, found["qpos"])]
+    groups = (positions, velocities, found["ctrl"], found["qfrc"], sorted(found["param"]), missing)
+    return Columns(*map(tuple, groups))
+
+
+def _coordinates(joint: str, names: list[str]) -> list[str]:
+    return sorted(name for name in names if joint_of(name) == joint)
+
+
+def _near(name: str) -> str:
+    prefix, dot, rest = name.partition(".")
+    choices = [*PLAIN, *PREFIXES]
+    near = difflib.get_close_matches(prefix, choices, n=2, cutoff=0.5)
+    if near:
+        return "did you mean " + " or ".join(repr(c + (dot + rest if c in PREFIXES else "")) for c in near) + "?"
+    return f"columns are {', '.join(PLAIN)} and those that begin with {', '.join(p + '.' for p in PREFIXES)}"

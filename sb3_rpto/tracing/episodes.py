@@ -1,0 +1,196 @@
+"""One recorded run: read from a table, checked, repaired."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sb3_rpto.tracing import checks
+from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.columns import Columns, joint_of
+
+Table = Mapping[str, np.ndarray]
+PARTS = ("train", "select", "test")
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One uninterrupted recording. Columns of the arrays are named by the :class:`Measurements` that hold it.
+
+    :param name: unique name; ``<run>/0``, ``<run>/1`` … where a run was split at gaps
+    :param run: name of the run it belongs to; splits keep a run together
+    :param time: increasing times in s, shape (T,)
+    :param qpos: positions in rad or m, shape (T, nq)
+    :param qvel: velocities in rad/s or m/s, shape (T, nv)
+    :param ctrl: commands in the actuators' units, shape (T, nu)
+    :param qfrc: measured generalised forces in N·m or N, shape (T, nf)
+    :param enabled: False where an actuator was switched off, shape (T, nu)
+    :param params: settings known for this run, ``object.parameter`` to SI value
+    :param part: ``"train"``, ``"select"`` or ``"test"`` where the file says so
+    """
+
+    name: str
+    run: str
+    time: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    ctrl: np.ndarray
+    qfrc: np.ndarray
+    enabled: np.ndarray
+    params: Mapping[str, float] = field(default_factory=dict)
+    part: str | None = None
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+def runs_of(file: str, table: Table) -> dict[str | None, dict[str, np.ndarray]]:
+    """Check the values of a table and part its rows by episode."""
+    lengths = {name: np.shape(values) for name, values in table.items()}
+    if len(set(lengths.values())) != 1 or len(lengths["time"]) != 1:
+        raise ValueError(f"{file}: columns must all have one shape (T,); got {lengths}")
+    if "episode" in table and lengths["time"] == (0,):
+        raise ValueError(f"{file}: the table has no rows; give one row a sample")
+    rows: dict[str, np.ndarray] = {}
+    for name, values in table.items():
+        if name in ("episode", "split"):
+            rows[name] = np.asarray(values).astype(str)
+            blank = np.flatnonzero(np.isin(rows[name], ("", "nan", "None")))
+            if len(blank):
+                raise ValueError(f"{file}: column {name!r} is empty in row {blank[0]}; fill it in on every row")
+            continue
+        try:
+            rows[name] = np.asarray(values).astype(np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"{file}: column {name!r} holds something that is not a number; correct or remove it"
+            ) from None
+        bad = np.flatnonzero(~np.isfinite(rows[name]))
+        if len(bad):
+            raise ValueError(
+                f"{file}: column {name!r} has {len(bad)} NaN or infinite value(s), first in row {bad[0]} "
+                "(counted from 0 below the header); drop those rows, a gap is handled"
+            )
+    if "episode" not in rows:
+        return {None: rows}
+    names = dict.fromkeys(rows["episode"].tolist())
+    return {name: {c: values[rows["episode"] == name] for c, values in rows.items()} for name in names}
+
+
+def read_run(file: str, name: str, rows: dict[str, np.ndarray], columns: Columns) -> Episode:
+    """Check one run and stack its columns; velocities without a column stay NaN until the gaps are known."""
+    where = f"{file}, episode {name}"
+    time = rows["time"]
+    if len(time) < checks.MIN_ROWS:
+        raise ValueError(
+            f"{where}: {len(time)} rows are too few; give at least {checks.MIN_ROWS} or remove the episode"
+        )
+    back = np.flatnonzero(np.diff(time) <= 0)
+    if len(back):
+        raise ValueError(
+            f"{where}: column 'time' does not increase at row {back[0] + 1} of the episode ({time[back[0]]:g} s, then "
+            f"{time[back[0] + 1]:g} s); sort the rows, drop doubled ones, or give each run its own episode"
+        )
+    for column in (c for c in rows if c == "split" or c.startswith("param.")):
+        if len(np.unique(rows[column])) > 1:
+            raise ValueError(
+                f"{where}: column {column!r} changes within the episode; it must be constant, make it two episodes"
+            )
+    part = str(rows["split"][0]) if "split" in rows else None
+    if part is not None and part not in PARTS:
+        raise ValueError(f"{where}: column 'split' holds {part!r}; use one of {', '.join(PARTS)}")
+
+    def stack(prefix: str, names: tuple[str, ...], default: float) -> np.ndarray:
+        blank = np.full(len(time), default)
+        return np.stack([rows.get(f"{prefix}.{n}", blank) for n in names], 1) if names else np.empty((len(time), 0))
+
+    enabled = stack("enabled", columns.ctrl, 1.0)
+    if not np.isin(enabled, (0.0, 1.0)).all():
+        actuator = columns.ctrl[int(np.flatnonzero(~np.isin(enabled, (0.0, 1.0)).all(0))[0])]
+        raise ValueError(f"{where}: column 'enabled.{actuator}' holds more than 0 and 1; use 1 for on and 0 for off")
+    return Episode(
+        name=name,
+        run=name,
+        time=time,
+        qpos=stack("qpos", columns.qpos, np.nan),
+        qvel=stack("qvel", columns.qvel, np.nan),
+        ctrl=stack("ctrl", columns.ctrl, 0.0),
+        qfrc=stack("qfrc", columns.qfrc, np.nan),
+        enabled=enabled.astype(bool),
+        params={p: float(rows[f"param.{p}"][0]) for p in columns.params},
+        part=part,
+    )
+
+
+def repair(run: Episode, columns: Columns, findings: list[Finding]) -> list[Episode]:
+    """Split a run at its gaps, unwrap its angles, estimate what velocities it lacks; report each."""
+    slices = checks.split_at_gaps(run.time)
+    if len(slices) > 1:
+        longest = max(run.time[s.start] - run.time[s.start - 1] for s in slices[1:])
+        message = (
+            f"{len(slices) - 1} gap(s) in time, the longest {longest:.4g} s; split there into {len(slices)} episodes"
+        )
+        findings.append(Finding("gap", run.name, message))
+    pieces = []
+    for i, rows in enumerate(slices):
+        name = run.name if len(slices) == 1 else f"{run.name}/{i}"
+        if rows.stop - rows.start < checks.MIN_ROWS:
+            message = f"{rows.stop - rows.start} row(s) between gaps are too few to use; set aside"
+            findings.append(Finding("short", name, message))
+            continue
+        arrays = {k: getattr(run, k)[rows].copy() for k in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled")}
+        pieces.append(replace(run, name=name, **arrays))
+        _channels(pieces[-1], columns, findings)
+    return pieces
+
+
+def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> None:
+    """Check and repair, in place, the channels of an episode that is not yet handed out."""
+
+    def say(kind: str, message: str, column: str = "time") -> None:
+        findings.append(Finding(kind, f"{episode.name}, {column}", message))
+
+    time = episode.time
+    spread = checks.jitter(time)
+    if spread > checks.JITTER:
+        say(
+            "jitter",
+            f"steps vary by {spread:.0%} around their median of {np.median(np.diff(time)):.4g} s; kept as they are",
+        )
+    for i, name in enumerate(columns.qpos):
+        # A turn means nothing to the coordinates of a ball or free joint.
+        if name != joint_of(name):
+            continue
+        episode.qpos[:, i], jumps = checks.unwrap(episode.qpos[:, i])
+        if jumps:
+            say("wrapped angle", f"{jumps} jump(s) of nearly one turn; unwrapped", f"qpos.{name}")
+    for i, name in enumerate(columns.qvel):
+        velocity = episode.qvel[:, i]
+        position = episode.qpos[:, columns.qpos.index(name)] if name == joint_of(name) else None
+        if name in columns.missing and position is not None:
+            episode.qvel[:, i] = checks.smoothed_velocity(time, position)
+            say(
+                "missing velocity",
+                "not measured; estimated from the position by a cubic Savitzky-Golay filter",
+                f"qvel.{name}",
+            )
+            continue
+        step = checks.quantum(velocity)
+        if step is not None:
+            levels = len(np.unique(velocity))
+            say(
+                "quantised velocity",
+                f"{levels} distinct values in {len(time)} samples, smallest step {step:.4g}",
+                f"qvel.{name}",
+            )
+        slope = None if position is None else checks.velocity_slope(time, position, velocity)
+        if slope is None or checks.SLOPE[0] <= slope <= checks.SLOPE[1]:
+            continue
+        kind, cause = (
+            ("flipped velocity", "its sign is flipped") if slope < 0 else ("velocity slope", "check units and filters")
+        )
+        say(
+            kind,
+            f"slope against the differentiated position is {slope:.2f}, not 1: {cause}; kept as it is",
+            f"qvel.{name}",
+        )

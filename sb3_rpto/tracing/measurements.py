@@ -1,0 +1,229 @@
+"""Recorded episodes of a machine, read from files and checked before anything is fitted to them."""
+
+import csv
+import glob
+import gzip
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_rpto.tracing import checks
+from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.columns import Columns, joint_of, read_columns
+from sb3_rpto.tracing.episodes import PARTS, Episode, Table, read_run, repair, runs_of
+
+Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Recorded episodes with the names of their columns and all that was found while reading them.
+
+    :param episodes: the recordings
+    :param columns: names of the arrays' columns
+    :param findings: what a reader of the results must know; nothing is repaired without one
+    """
+
+    episodes: list[Episode]
+    columns: Columns
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joint names, in the order of the columns."""
+        return tuple(dict.fromkeys(map(joint_of, self.columns.qpos)))
+
+    @property
+    def actuators(self) -> tuple[str, ...]:
+        """Actuator names, in the order of the columns of ``ctrl``."""
+        return self.columns.ctrl
+
+    @classmethod
+    def from_csv(cls, paths: Paths) -> "Measurements":
+        """Read CSV files, also gzipped (``.csv.gz``); a file without an ``episode`` column is one episode.
+
+        :param paths: a path, a glob pattern, or several of them
+        :raises FileNotFoundError: nothing matches
+        :raises ValueError: the data break the file format (see :meth:`from_tables`)
+        """
+        return cls.from_tables({path: _read_csv(path) for path in _expand(paths)})
+
+    @classmethod
+    def from_parquet(cls, paths: Paths) -> "Measurements":
+        """Read Parquet files, as :meth:`from_csv` does.
+
+        :param paths: as there
+        :raises ImportError: pandas is not installed; pandas itself asks for pyarrow
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            message = "reading Parquet needs pandas and pyarrow: pip install 'sb3-rpto[experiments]' pyarrow"
+            raise ImportError(message) from error
+        frames = {path: pandas.read_parquet(path) for path in _expand(paths)}
+        return cls.from_tables({p: {name: f[name].to_numpy() for name in f.columns} for p, f in frames.items()})
+
+    @classmethod
+    def from_npz(cls, paths: Paths) -> "Measurements":
+        """Read npz archives with one array of shape (T,) for each column, as :meth:`from_csv` does."""
+        tables = {}
+        for path in _expand(paths):
+            with np.load(path, allow_pickle=False) as archive:
+                tables[path] = {name: archive[name] for name in archive.files}
+        return cls.from_tables(tables)
+
+    @classmethod
+    def from_tables(cls, tables: Mapping[str, Table]) -> "Measurements":
+        """Check tables of columns in memory and cut them into episodes.
+
+        :param tables: for each file name, its columns, all of shape (T,), in SI units
+        :raises ValueError: unknown, missing or differing columns, NaN or infinity, time that does not increase, too
+            few rows, a setting or a split that changes within an episode; the message names the place and the remedy
+        """
+        if not tables:
+            raise ValueError("no tables; give at least one")
+        stems = [Path(name).stem for name in tables]
+        findings: list[Finding] = []
+        episodes: list[Episode] = []
+        seen: dict[bytes, str] = {}
+        first = next(iter(tables))
+        columns = read_columns(tables[first], first)
+        for (file, table), stem in zip(tables.items(), stems):
+            read_columns(table, file)
+            differing = sorted(set(table) ^ set(tables[first]))
+            if differing:
+                raise ValueError(
+                    f"{file}: column {differing[0]!r} is not in both this file and {first}; "
+                    "all files need the same columns"
+                )
+            label = stem if stems.count(stem) == 1 else file
+            for key, rows in runs_of(file, table).items():
+                name = label if key is None else key if len(tables) == 1 else f"{label}:{key}"
+                run = read_run(file, name, rows, columns)
+                content = b"".join(
+                    rows[c].tobytes() for c in sorted(rows) if c.startswith(("qpos", "qvel", "ctrl", "qfrc", "enabled"))
+                )
+                content += (run.time - run.time[0]).round(9).tobytes()
+                if content in seen:
+                    message = f"the same samples as episode {seen[content]}; only that one is kept"
+                    findings.append(Finding("duplicate", name, message))
+                    continue
+                seen[content] = name
+                episodes += repair(run, columns, findings)
+        if not episodes:
+            raise ValueError(
+                f"{first}: no stretch between gaps has {checks.MIN_ROWS} rows; record longer or drop fewer samples"
+            )
+        return cls(episodes, columns, findings)
+
+    def tables(self) -> dict[str, np.ndarray]:
+        """All samples as one table of columns of shape (sum of T,), in the file format, for any writer.
+
+        Repairs are in it: unwrapped angles, estimated velocities, one episode for each stretch between gaps (and one
+        run, when read again).
+        """
+
+        def join(arrays: Iterable[Any]) -> np.ndarray:
+            return np.concatenate(list(arrays))
+
+        lengths = [len(e) for e in self.episodes]
+        table = {
+            "episode": np.repeat([e.name for e in self.episodes], lengths),
+            "time": join(e.time for e in self.episodes),
+        }
+        c = self.columns
+        for prefix, names in (
+            ("qpos", c.qpos),
+            ("qvel", c.qvel),
+            ("ctrl", c.ctrl),
+            ("qfrc", c.qfrc),
+            ("enabled", c.ctrl),
+        ):
+            for i, name in enumerate(names):
+                values = join(getattr(e, prefix)[:, i] for e in self.episodes)
+                table[f"{prefix}.{name}"] = values.astype(float)
+        for name in c.params:
+            table[f"param.{name}"] = np.repeat([e.params[name] for e in self.episodes], lengths)
+        if self.episodes[0].part is not None:
+            table["split"] = np.repeat([str(e.part) for e in self.episodes], lengths)
+        return table
+
+    def split(
+        self, seed: int, fractions: Sequence[float] = (0.6, 0.2, 0.2)
+    ) -> tuple["Measurements", "Measurements", "Measurements"]:
+        """Part the data into train, select and test by whole runs.
+
+        A ``split`` column is honoured. Without one, runs are drawn by seed, at least one for test where there are two.
+        Where fewer than three training runs would remain, those for select are added to them and select is empty,
+        which is a finding.
+
+        :param seed: of the draw; the order of the files does not matter
+        :param fractions: of the runs for train, select and test; they sum to one
+        :return: three measurements; all carry the findings, select or test may have no episodes
+        :raises ValueError: fractions that are negative or do not sum to one, a ``split`` column without train
+        """
+        if len(fractions) != 3 or min(fractions) < 0 or fractions[0] == 0 or abs(sum(fractions) - 1) > 1e-6:
+            raise ValueError(
+                f"fractions must be three numbers >= 0 that sum to 1, the first > 0; got {tuple(fractions)}"
+            )
+        findings = list(self.findings)
+        if self.episodes and self.episodes[0].part is not None:
+            part = {e.run: str(e.part) for e in self.episodes}
+            for name in PARTS:
+                if name not in part.values():
+                    if name == "train":
+                        raise ValueError("no episode has 'train' in the column 'split'; name at least one")
+                    findings.append(Finding("split", "all episodes", f"the column 'split' names no {name} episode"))
+        else:
+            runs = sorted({e.run for e in self.episodes})
+            n = len(runs)
+            n_test = min(max(1, round(fractions[2] * n)), n - 1) if n >= 2 else 0
+            n_select = min(round(fractions[1] * n), n - n_test)
+            if n_test == 0:
+                findings.append(
+                    Finding("split", "all episodes", "there is but one run: no test data, errors cannot be held out")
+                )
+            if n - n_test - n_select < 3:
+                n_select = 0
+                message = (
+                    f"{n - n_test} run(s) remain for training: none is set apart to select on, "
+                    "use blocks of the training runs"
+                )
+                findings.append(Finding("split", "all episodes", message))
+            order = [runs[i] for i in np.random.default_rng(seed).permutation(n)]
+            part = {
+                r: "test" if i < n_test else "select" if i < n_test + n_select else "train" for i, r in enumerate(order)
+            }
+        train, select, test = ([e for e in self.episodes if part[e.run] == name] for name in PARTS)
+        return tuple(replace(self, episodes=e, findings=list(findings)) for e in (train, select, test))  # type: ignore[return-value]
+
+
+def _read_csv(path: str) -> dict[str, np.ndarray]:
+    """Columns as strings: numpy turns them into the nearest floats, which some faster parsers do not."""
+    opener = gzip.open if path.endswith(".gz") else open
+    with opener(path, "rt", newline="", encoding="utf-8-sig") as stream:
+        rows = [row for row in csv.reader(stream) if row]
+    if not rows:
+        raise ValueError(f"{path}: the file is empty; give a header and one row a sample")
+    header = rows.pop(0)
+    read_columns(header, path)
+    for number, row in enumerate(rows):
+        if len(row) != len(header):
+            raise ValueError(f"{path}: row {number} has {len(row)} fields, the header {len(header)}; correct that row")
+    cells = np.array([[cell or "nan" for cell in row] for row in rows], dtype=str).reshape(-1, len(header))
+    return dict(zip(header, cells.T))
+
+
+def _expand(paths: Paths) -> list[str]:
+    patterns = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
+    found: list[str] = []
+    for pattern in [os.fspath(p) for p in patterns]:
+        matches = [pattern] if os.path.exists(pattern) else sorted(glob.glob(pattern, recursive=True))
+        if not matches:
+            raise FileNotFoundError(f"no file matches {pattern!r}; check the path or the pattern")
+        found += matches
+    return list(dict.fromkeys(found))

@@ -1,0 +1,353 @@
+import builtins
+import gzip
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_rpto.tracing import Measurements
+from sb3_rpto.tracing.checks import quantum, smoothed_velocity, split_at_gaps, unwrap, velocity_slope
+from sb3_rpto.tracing.columns import read_columns
+
+MEASURED = Path(__file__).parents[3] / "shared" / "measured"
+
+
+def swing(phase=0.0, n=200, dt=0.01, **extra):
+    """A clean run of one joint."""
+    time = np.arange(n) * dt
+    table = {
+        "time": time,
+        "qpos.hinge": np.sin(2 * time + phase),
+        "qvel.hinge": 2 * np.cos(2 * time + phase),
+        "ctrl.motor": np.cos(time),
+    }
+    return {**table, **{name.replace("__", "."): value for name, value in extra.items()}}
+
+
+def several(count, **extra):
+    return Measurements.from_tables({f"run{i}": swing(phase=i, **extra) for i in range(count)})
+
+
+def kinds(data):
+    return [f.kind for f in data.findings]
+
+
+def stack(*tables):
+    """Several runs in one table, with an episode column."""
+    table = {name: np.concatenate([t[name] for t in tables]) for name in tables[0]}
+    return {"episode": np.repeat(np.arange(len(tables)), [len(t["time"]) for t in tables]), **table}
+
+
+def write_csv(path, table):
+    rows = zip(*(values.tolist() for values in table.values()))
+    path.write_text("\n".join([",".join(table), *(",".join(map(str, row)) for row in rows)]))
+
+
+def test_clean_data_have_no_findings():
+    data = Measurements.from_tables({"a": swing()})
+    assert data.findings == []
+    assert data.joints == ("hinge",)
+    assert data.actuators == ("motor",)
+    (episode,) = data.episodes
+    assert episode.qpos.shape == episode.qvel.shape == episode.ctrl.shape == (200, 1)
+    assert episode.qfrc.shape == (200, 0)
+    assert episode.enabled.all()
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
+def test_round_trip_is_exact(kind, tmp_path):
+    rng = np.random.default_rng(0)
+    on = rng.integers(0, 2, 400).astype(float)
+    extra = {"qfrc.hinge": rng.normal(size=400), "enabled.motor": on, "param.arm.mass": np.repeat([0.1, 1 / 3], 200)}
+    table = {**stack(swing(), swing(1.0)), **extra, "split": np.repeat(["train", "test"], 200)}
+    path = tmp_path / f"log.{kind}"
+    if kind == "npz":
+        np.savez(path, **table)
+        data = Measurements.from_npz(path)
+    elif kind == "csv":
+        write_csv(path, table)
+        data = Measurements.from_csv(str(tmp_path / "*.csv"))
+    else:
+        pytest.importorskip("pyarrow")
+        pytest.importorskip("pandas").DataFrame(table).to_parquet(path)
+        data = Measurements.from_parquet([path])
+    back = data.tables()
+    assert set(back) == set(table)
+    for name, values in table.items():
+        np.testing.assert_array_equal(back[name], values.astype(str) if name == "episode" else values)
+    assert data.episodes[1].params == {"arm.mass": 1 / 3}
+    np.testing.assert_array_equal(data.episodes[0].enabled[:, 0], on[:200] == 1)
+
+
+def test_files_with_the_same_episode_numbers_are_kept_apart():
+    data = Measurements.from_tables({"x/a.csv": stack(swing(0), swing(1)), "y/a.csv": stack(swing(2), swing(3))})
+    assert [e.name for e in data.episodes] == ["x/a.csv:0", "x/a.csv:1", "y/a.csv:0", "y/a.csv:1"]
+
+
+def test_free_joint_has_seven_and_six_columns():
+    names = ["time", *(f"qpos.root.{i}" for i in range(7)), *(f"qvel.root.{i}" for i in range(6))]
+    columns = read_columns(names, "a")
+    assert len(columns.qpos) == 7
+    assert len(columns.qvel) == 6
+    with pytest.raises(ValueError, match="7 and 6 for a free joint"):
+        read_columns(names[:-1], "a")
+
+
+def edited(**changes):
+    table = swing()
+    for name, value in changes.items():
+        name = name.replace("__", ".")
+        if value is None:
+            del table[name]
+        else:
+            table[name] = value
+    return table
+
+
+def planted(value, row=7, column="qpos.hinge"):
+    table = swing()
+    table[column][row] = value
+    return table
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (edited(qpso__hinge=np.zeros(200)), r"a: unknown column 'qpso.hinge'; did you mean 'qpos.hinge'"),
+        (edited(zzz=np.zeros(200)), r"unknown column 'zzz'; columns are"),
+        (edited(time=None), r"no column 'time'"),
+        (edited(qpos__hinge=None, qvel__hinge=None), r"no column 'qpos.<joint>'"),
+        (edited(qpos__hinge=None, qpos__arm=np.zeros(200)), r"'qvel.hinge' has no 'qpos.hinge'"),
+        (edited(enabled__fan=np.ones(200)), r"'enabled.fan' has no 'ctrl.fan'"),
+        (edited(enabled__motor=np.full(200, 0.5)), r"'enabled.motor' holds more than 0 and 1"),
+        (edited(param__arm__mass=np.arange(200.0)), r"'param.arm.mass' changes within the episode"),
+        (edited(split=np.repeat(["train", "test"], 100)), r"'split' changes within the episode"),
+        (edited(split=np.repeat(["valid"], 200)), r"'split' holds 'valid'; use one of train, select, test"),
+        (edited(episode=np.repeat([0, np.nan], 100)), r"'episode' is empty in row 100"),
+        (edited(ctrl__motor=np.repeat(["on"], 200)), r"'ctrl.motor' holds something that is not a number"),
+        (edited(ctrl__motor=np.zeros(3)), r"one shape"),
+        (planted(np.nan), r"a: column 'qpos.hinge' has 1 NaN or infinite value\(s\), first in row 7"),
+        (planted(np.inf, column="ctrl.motor"), r"'ctrl.motor' has 1 NaN or infinite"),
+        (planted(0.01, row=2, column="time"), r"a, episode a: column 'time' does not increase at row 2"),
+        (swing(n=4), r"4 rows are too few; give at least 5"),
+    ],
+)
+def test_bad_tables_are_refused(table, message):
+    with pytest.raises(ValueError, match=message):
+        Measurements.from_tables({"a": table})
+
+
+def test_files_need_the_same_columns():
+    with pytest.raises(ValueError, match=r"b: column 'ctrl.motor' is not in both"):
+        Measurements.from_tables({"a": swing(), "b": edited(ctrl__motor=None)})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("time,qpos.hinge,qpos.hinge\n0,1,2\n", r"'qpos.hinge' is there twice"),
+        ("", "the file is empty"),
+        ("time,qpos.hinge\n0,1\n0.1\n", "row 1 has 1 fields, the header 2"),
+        ("time,qpos.hinge\n0,1\n0.1,\n", r"'qpos.hinge' has 1 NaN or infinite value\(s\), first in row 1"),
+        ("time,qpos.hinge\n", "0 rows are too few"),
+        ("episode,time,qpos.hinge\n", "no rows"),
+    ],
+)
+def test_bad_csv_is_refused(text, message, tmp_path):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        Measurements.from_csv(tmp_path / "a.csv")
+
+
+def test_gzipped_csv(tmp_path):
+    write_csv(tmp_path / "a.csv", swing())
+    (tmp_path / "a.csv.gz").write_bytes(gzip.compress((tmp_path / "a.csv").read_bytes()))
+    (episode,) = Measurements.from_csv(tmp_path / "*.gz").episodes
+    np.testing.assert_array_equal(episode.qpos[:, 0], swing()["qpos.hinge"])
+
+
+def test_no_tables_no_files():
+    with pytest.raises(ValueError, match="no tables"):
+        Measurements.from_tables({})
+    with pytest.raises(FileNotFoundError, match="no file matches"):
+        Measurements.from_npz("nothing/*.npz")
+
+
+def test_without_pandas_the_extra_is_named(monkeypatch):
+    real = builtins.__import__
+
+    def refuse(name, *args, **kwargs):
+        if name == "pandas":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(ImportError, match=r"experiments"):
+        Measurements.from_parquet("a.parquet")
+
+
+def test_gap_splits_the_episode_and_keeps_the_run_together():
+    table = swing()
+    table["time"][80:] += 0.2
+    data = Measurements.from_tables({"a": table})
+    assert [(e.name, e.run, len(e)) for e in data.episodes] == [("a/0", "a", 80), ("a/1", "a", 120)]
+    assert kinds(data) == ["gap"]
+    train, select, test = data.split(0)
+    assert [len(m.episodes) for m in (train, select, test)] == [2, 0, 0]
+
+
+def test_short_stretch_is_set_aside_with_a_finding():
+    table = swing()
+    table["time"][197:] += 0.2
+    data = Measurements.from_tables({"a": table})
+    assert [len(e) for e in data.episodes] == [197]
+    assert kinds(data) == ["gap", "short"]
+
+
+@given(st.lists(st.floats(1e-3, 10.0), max_size=60))
+@settings(max_examples=100, deadline=None)
+def test_splitting_at_gaps_loses_no_sample(steps):
+    time = np.concatenate([[0.0], np.cumsum(steps)])
+    slices = split_at_gaps(time)
+    np.testing.assert_array_equal(np.concatenate([time[s] for s in slices]), time)
+    limit = 5 * np.median(np.diff(time)) if steps else 0
+    assert all(np.all(np.diff(time[s]) <= limit) for s in slices)
+    assert all(time[b.start] - time[b.start - 1] > limit for b in slices[1:])
+
+
+def test_jitter_is_reported():
+    time = np.arange(200) * 0.01 + np.random.default_rng(0).uniform(-0.002, 0.002, 200)
+    table = {"time": time, "qpos.hinge": np.sin(time), "qvel.hinge": np.cos(time)}
+    assert kinds(Measurements.from_tables({"a": table})) == ["jitter"]
+
+
+def test_wrapped_angle_is_unwrapped_and_reported():
+    time = np.arange(300) * 0.01
+    true = 5 * np.sin(3 * time) + 2
+    wrapped = np.angle(np.exp(1j * true))
+    data = Measurements.from_tables({"a": {"time": time, "qpos.hinge": wrapped, "qvel.hinge": 15 * np.cos(3 * time)}})
+    assert kinds(data) == ["wrapped angle"]
+    np.testing.assert_allclose(data.episodes[0].qpos[:, 0], true, rtol=0, atol=1e-12)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=50, deadline=None)
+def test_unwrap_restores_any_smooth_angle(seed):
+    steps = np.random.default_rng(seed).uniform(-1.5, 1.5, 100)
+    true = np.cumsum(steps) - steps[0]
+    np.testing.assert_allclose(unwrap(np.angle(np.exp(1j * true)))[0], true, atol=1e-10)
+
+
+def test_a_continuous_angle_is_left_alone():
+    angle = np.linspace(-20, 20, 100)
+    assert unwrap(angle)[0] is angle
+
+
+def test_quantised_velocity_is_reported():
+    table = swing()
+    table["qvel.hinge"] = np.round(table["qvel.hinge"] / 0.25) * 0.25
+    data = Measurements.from_tables({"a": table})
+    assert kinds(data) == ["quantised velocity"]
+    assert "0.25" in data.findings[0].message
+    assert quantum(np.concatenate([np.zeros(500), swing()["qvel.hinge"]])) is None
+
+
+def test_missing_velocity_is_estimated_and_reported():
+    data = Measurements.from_tables({"a": edited(qvel__hinge=None)})
+    assert kinds(data) == ["missing velocity"]
+    np.testing.assert_allclose(data.episodes[0].qvel[:, 0], swing()["qvel.hinge"], atol=1e-3)
+
+
+def test_velocity_estimate_is_exact_for_constant_speed_on_a_jittered_clock():
+    time = np.cumsum(np.random.default_rng(0).uniform(0.5, 1.5, 40))
+    np.testing.assert_allclose(smoothed_velocity(time, 3 * time + 1), 3.0, rtol=1e-9)
+    np.testing.assert_allclose(smoothed_velocity(time[:5], 3 * time[:5]), 3.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("factor", "kind"), [(-1.0, "flipped velocity"), (180 / np.pi, "velocity slope")])
+def test_velocity_against_position_is_reported(factor, kind):
+    table = swing()
+    table["qvel.hinge"] *= factor
+    data = Measurements.from_tables({"a": table})
+    assert kinds(data) == [kind]
+    assert f"{factor:.2f}" in data.findings[0].message
+
+
+def test_slope_of_a_resting_joint_is_not_judged():
+    rng = np.random.default_rng(0)
+    assert velocity_slope(np.arange(200) * 0.01, rng.normal(size=200) * 1e-3, rng.normal(size=200)) is None
+
+
+def test_duplicate_is_dropped_and_reported():
+    later = swing()
+    later["time"] = later["time"] + 100.0
+    data = Measurements.from_tables({"a": swing(), "b": swing(1.0), "c": later})
+    assert [e.name for e in data.episodes] == ["a", "b"]
+    assert [str(f) for f in data.findings] == ["duplicate in c: the same samples as episode a; only that one is kept"]
+
+
+@given(st.integers(1, 15), st.integers(0, 1000))
+@settings(max_examples=30, deadline=None)
+def test_split_parts_the_runs(count, seed):
+    data = several(count, n=8)
+    parts = [[e.name for e in m.episodes] for m in data.split(seed)]
+    again = [[e.name for e in m.episodes] for m in data.split(seed)]
+    assert parts == again
+    assert sorted(chain(*parts)) == sorted(e.name for e in data.episodes)
+    assert parts[0]
+    assert bool(parts[2]) == (count >= 2)
+    assert len(parts[0]) >= 3 or not parts[1]
+
+
+def test_seed_changes_the_split_and_file_order_does_not():
+    data = several(10)
+    draws = {tuple(e.name for e in data.split(seed)[2].episodes) for seed in range(5)}
+    assert len(draws) > 1
+    tables = {f"run{i}": swing(phase=i) for i in reversed(range(10))}
+    other = Measurements.from_tables(tables).split(0)[2]
+    assert {e.name for e in other.episodes} == {e.name for e in data.split(0)[2].episodes}
+    assert [len(m.episodes) for m in data.split(0)] == [6, 2, 2]
+
+
+def test_few_runs_are_a_finding():
+    train, select, test = several(4).split(0)
+    assert [len(m.episodes) for m in (train, select, test)] == [3, 0, 1]
+    assert "use blocks of the training runs" in train.findings[-1].message
+    assert "no test data" in several(1).split(0)[0].findings[0].message
+
+
+def test_split_column_is_honoured():
+    parts = ["test", "train", "train", "select"]
+    tables = {f"run{i}": swing(phase=i, split=np.repeat([p], 200)) for i, p in enumerate(parts)}
+    split = Measurements.from_tables(tables).split(0)
+    assert [[e.name for e in m.episodes] for m in split] == [["run1", "run2"], ["run3"], ["run0"]]
+    del tables["run3"]
+    train, select, _ = Measurements.from_tables(tables).split(0)
+    assert select.episodes == []
+    assert "names no select episode" in train.findings[-1].message
+    with pytest.raises(ValueError, match="no episode has 'train'"):
+        Measurements.from_tables({"run0": tables["run0"]}).split(0)
+
+
+@pytest.mark.parametrize("fractions", [(0.5, 0.5), (0.5, 0.2, 0.2), (1.2, -0.2, 0.0), (0.0, 0.5, 0.5)])
+def test_bad_fractions(fractions):
+    with pytest.raises(ValueError, match="fractions must be"):
+        several(3).split(0, fractions)
+
+
+@pytest.mark.skipif(not MEASURED.is_dir(), reason="the measured sets are not here")
+def test_simple_pendulum_loads_with_its_quantised_velocity():
+    pandas = pytest.importorskip("pandas")
+    names = {"position": "qpos.hinge", "velocity": "qvel.hinge", "torque": "ctrl.motor"}
+    tables = {}
+    for path in sorted((MEASURED / "simple_pendulum").glob("*.csv")):
+        frame = pandas.read_csv(path).rename(columns=names)
+        tables[path.name] = {name: frame[name].to_numpy() for name in frame}
+    data = Measurements.from_tables(tables)
+    assert sum(len(e) for e in data.episodes) == sum(len(t["time"]) for t in tables.values()) == 6340
+    assert len(data.episodes) == 4
+    assert kinds(data).count("quantised velocity") == 4
+    assert not {"flipped velocity", "velocity slope", "wrapped angle", "gap"} & set(kinds(data))
