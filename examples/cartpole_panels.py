@@ -5,8 +5,8 @@
 
 Source: ContinuousCartPole, pole 1.0 m. Panels: (a) RPO against fine-tuned SAC at 1.2 m; (b) RPO over a range of
 lengths until it fails; (c) RTO's estimate of the length for several true lengths; (d) all methods at 2.0 m; (e) all
-methods under three larger shifts. The shifts of (e) were fixed by the zero-shot return of one policy that is not among
-the five seeds', before any method ran on them.
+methods under three larger shifts. How the shifts of (e) were
+chosen is told in docs/results.md.
 """
 
 from __future__ import annotations

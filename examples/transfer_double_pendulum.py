@@ -4,7 +4,7 @@
 
 Trains a source policy by SAC (kept in runs/double_pendulum for the next time), moves it to the target with a few
 hundred target steps, fine-tunes the same policy by plain SAC for comparison, prints what was gained and what it cost,
-and draws both learning curves. About five minutes on two cores the first time.
+and draws both learning curves. About three minutes on two cores the first time.
 """
 
 from __future__ import annotations

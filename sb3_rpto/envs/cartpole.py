@@ -114,7 +114,7 @@ def cartpole_reward(state: th.Tensor, parameters: CartPoleParameters) -> th.Tens
     """How close the cart is to the centre and the pole to upright: 1 - ((x / x_max)^2 + (theta / theta_max)^2) / 2.
 
     CartPole-v1's constant 1 says nothing of a slow drift until the cart leaves the track hundreds of steps later; SAC's
-    critic does not resolve that, and its policies drift off after about 200 steps.
+    critic resolves that badly: in development its policies mostly drifted off after 150 to 300 steps.
 
     :param state: (n, 4), the state that was reached
     :param parameters: only the thresholds matter
