@@ -27,6 +27,8 @@ class Episode:
     :param enabled: False where an actuator was switched off, shape (T, nu)
     :param params: settings known for this run, ``object.parameter`` to SI value
     :param part: ``"train"``, ``"select"`` or ``"test"`` where the file says so
+    :param usable: False where the state is not known, shape (T,); all True by default
+    :raises ValueError: ``usable`` does not fit ``time``
     """
 
     name: str
@@ -39,6 +41,15 @@ class Episode:
     enabled: np.ndarray
     params: Mapping[str, float] = field(default_factory=dict)
     part: str | None = None
+    usable: np.ndarray = field(default=None)  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.usable is None:
+            object.__setattr__(self, "usable", np.ones(len(self.time), dtype=bool))
+        if self.usable.shape != (len(self.time),):
+            raise ValueError(
+                f"{self.name}: usable has shape {self.usable.shape}, time {self.time.shape}; cut both in the same way"
+            )
 
     def __len__(self) -> int:
         return len(self.time)
@@ -138,7 +149,9 @@ def repair(run: Episode, columns: Columns, findings: list[Finding]) -> list[Epis
             message = f"{rows.stop - rows.start} row(s) between gaps are too few to use; set aside"
             findings.append(Finding("short", name, message))
             continue
-        arrays = {k: getattr(run, k)[rows].copy() for k in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled")}
+        arrays = {
+            k: getattr(run, k)[rows].copy() for k in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable")
+        }
         pieces.append(replace(run, name=name, **arrays))
         _channels(pieces[-1], columns, findings)
     return pieces

@@ -26,11 +26,15 @@ class Measurements:
     :param episodes: the recordings
     :param columns: names of the arrays' columns
     :param findings: what a reader of the results must know; nothing is repaired without one
+    :param unobserved: names of ``columns.qpos`` that were not measured: not to be compared with a prediction
+    :param exact: whether the samples come from a simulator: no measurement noise, exact velocities
     """
 
     episodes: list[Episode]
     columns: Columns
     findings: list[Finding] = field(default_factory=list)
+    unobserved: tuple[str, ...] = ()
+    exact: bool = False
 
     @property
     def joints(self) -> tuple[str, ...]:
