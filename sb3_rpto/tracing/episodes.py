@@ -41,7 +41,7 @@ class Episode:
     enabled: np.ndarray
     params: Mapping[str, float] = field(default_factory=dict)
     part: str | None = None
-    usable: np.ndarray = field(default=None)  # type: ignore[assignment]
+    usable: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         if self.usable is None:
