@@ -1,0 +1,285 @@
+"""Declared parameters: numbers of the model itself, by the MJCF's own names."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from sb3_rpto.effects.effect import Effect, Parameter, Scales
+from sb3_rpto.effects.length import link_length, write_length
+from sb3_rpto.effects.names import SCALAR_JOINTS, near, object_id, object_names
+from sb3_rpto.effects.world import World
+
+OBJECTS = ("joint", "body", "geom", "actuator")
+
+
+class _Kind(NamedTuple):
+    """How a sort of parameter is read from a model and written to a world."""
+
+    unit: str
+    read: Callable[[mujoco.MjModel, int], float]
+    write: Callable[[World, int, np.ndarray, float], None]  # world, id, values (n,), nominal
+    size: Callable[[Scales], float]  # scale of a fit where the nominal value is zero
+    span: tuple[float, float] | None = None  # default bounds as multiples of the nominal value; None: [0, inf)
+
+
+def _dof(name: str) -> tuple[Callable[[mujoco.MjModel, int], float], Callable[[World, int, np.ndarray, float], None]]:
+    def read(model: mujoco.MjModel, joint: int) -> float:
+        return float(getattr(model, name)[model.jnt_dofadr[joint]])
+
+    def write(world: World, joint: int, values: np.ndarray, nominal: float) -> None:
+        dof = int(world.model.jnt_dofadr[joint])
+        if name == "dof_frictionloss":
+            world.rough(dof)
+        world.field(name)[:, dof] = values
+
+    return read, write
+
+
+def _column(
+    name: str, column: int | None = None
+) -> tuple[Callable[[mujoco.MjModel, int], float], Callable[[World, int, np.ndarray, float], None]]:
+    def read(model: mujoco.MjModel, index: int) -> float:
+        values = getattr(model, name)[index]
+        return float(values if column is None else values[column])
+
+    def write(world: World, index: int, values: np.ndarray, nominal: float) -> None:
+        if column is None:
+            world.field(name)[:, index] = values
+        else:
+            world.field(name)[:, index, column] = values
+
+    return read, write
+
+
+def _write_mass(world: World, body: int, values: np.ndarray, nominal: float) -> None:
+    world.field("body_mass")[:, body] *= values / nominal
+    world.field("body_inertia")[:, body] *= (values / nominal)[:, None]
+
+
+def _write_inertia(world: World, body: int, values: np.ndarray, nominal: float) -> None:
+    world.field("body_inertia")[:, body] *= (values / nominal)[:, None]
+
+
+def _write_kp(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
+    world.field("actuator_gainprm")[:, actuator, 0] = values
+    if world.model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
+        world.field("actuator_biasprm")[:, actuator, 1] = -values
+
+
+def _write_strength(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
+    for name in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"):
+        world.field(name)[:, actuator] *= values[:, None]
+
+
+def _one(model: mujoco.MjModel, index: int) -> float:
+    return 1.0
+
+
+def _friction_size(scales: Scales) -> float:
+    return 0.05 * scales.torque
+
+
+def _viscous_size(scales: Scales) -> float:
+    return 0.05 * scales.torque / scales.velocity
+
+
+_POSITIVE = (0.1, 10.0)
+_KINDS: dict[str, dict[str, _Kind]] = {
+    "joint": {
+        "damping": _Kind("N·m·s/rad", *_dof("dof_damping"), _viscous_size),
+        "frictionloss": _Kind("N·m", *_dof("dof_frictionloss"), _friction_size),
+        "armature": _Kind("kg·m²", *_dof("dof_armature"), lambda s: 0.05 * s.inertia),
+        "stiffness": _Kind("N·m/rad", *_column("jnt_stiffness"), lambda s: 0.05 * s.torque / s.span),
+    },
+    "body": {
+        "mass": _Kind("kg", *_column("body_mass")[:1], _write_mass, lambda s: 0.05 * s.mass, _POSITIVE),
+        "inertia": _Kind("kg·m²", *_column("body_inertia", 0)[:1], _write_inertia, lambda s: s.inertia, _POSITIVE),
+        "length": _Kind("m", link_length, write_length, lambda s: 0.1, (0.5, 2.0)),
+    },
+    "geom": {"friction": _Kind("", *_column("geom_friction", 0), lambda s: 0.1)},
+    "actuator": {
+        "gear": _Kind("", *_column("actuator_gear", 0), lambda s: 1.0, _POSITIVE),
+        "gain": _Kind("", *_column("actuator_gainprm", 0), lambda s: 1.0, _POSITIVE),
+        "kp": _Kind("N·m/rad", *_column("actuator_gainprm", 0)[:1], _write_kp, lambda s: 1.0, _POSITIVE),
+        "strength": _Kind("", _one, _write_strength, lambda s: 1.0, _POSITIVE),
+        "damping": _Kind("N·m·s/rad", *_column("actuator_damping"), _viscous_size),
+    },
+}
+
+
+def _write_gravity(world: World, index: int, values: np.ndarray, nominal: float) -> None:
+    world.field("opt.gravity")[:] *= (values / nominal)[:, None]
+
+
+def _option(
+    name: str,
+) -> tuple[Callable[[mujoco.MjModel, int], float], Callable[[World, int, np.ndarray, float], None]]:
+    def read(model: mujoco.MjModel, index: int) -> float:
+        return float(getattr(model.opt, name))
+
+    def write(world: World, index: int, values: np.ndarray, nominal: float) -> None:
+        world.field(f"opt.{name}")[:] = values.reshape(world.field(f"opt.{name}").shape)
+
+    return read, write
+
+
+_OPTIONS: dict[str, _Kind] = {
+    "gravity": _Kind(
+        "m/s²",
+        lambda model, _: float(np.linalg.norm(model.opt.gravity)),
+        _write_gravity,
+        lambda s: 1.0,
+        (0.1, 10.0),
+    ),
+    "viscosity": _Kind("Pa·s", *_option("viscosity"), lambda s: 0.1),
+    "density": _Kind("kg/m³", *_option("density"), lambda s: 100.0),
+}
+
+
+class Declared(Effect):
+    """One number of the model that its user declared unknown, e.g. ``hinge.damping``; its null is the nominal value.
+
+    ``mass`` scales the inertia with it, ``inertia`` leaves the mass, ``length`` is that of a link: its capsules and
+    the offsets of its children, at constant density (see :mod:`sb3_rpto.effects.length`); ``kp`` is the stiffness of
+    a position servo, ``strength`` a factor on all that an actuator does (gain, bias and force limits).
+
+    :param model: the model that has it
+    :param name: ``<object>.<parameter>``, with ``joint:`` (``body:``, ``geom:``, ``actuator:``) before the object
+        where two objects share a name, and ``option`` as the object of ``gravity``, ``viscosity`` and ``density``
+    :param bounds: smallest and largest value; default: from 0, or a tenth to ten times the nominal value
+    :raises ValueError: no such object or parameter, a nominal value of zero where only factors make sense, bounds that
+        do not hold the nominal value
+    """
+
+    kind = "declared"
+    place = "world"
+    equation = "a number of the model"
+
+    def __init__(self, model: mujoco.MjModel, name: str, bounds: tuple[float, float] | None = None) -> None:
+        self._where, self.index, self._how = _find(model, name)
+        how = self._how
+        nominal = how.read(model, self.index)
+        if how.span is not None and nominal == 0:
+            raise ValueError(f"{name} is 0 in the model, so it cannot be scaled; give it a value in the MJCF")
+        lower, upper = bounds or ((0.0, np.inf) if how.span is None else tuple(nominal * s for s in how.span))
+        if not lower <= nominal <= upper or lower == upper:
+            raise ValueError(f"{name}: the bounds [{lower:g}, {upper:g}] do not hold the nominal value {nominal:g}")
+        size: float | Callable[[Scales], float] = 0.1 * abs(nominal) if nominal else how.size
+        # An instance has its own parameter, with the model's value as its null.
+        self.parameters = (Parameter(name, how.unit, size, lower, upper, nominal),)  # type: ignore[misc]
+        self.nominal = nominal
+        super().__init__("")
+
+    @property
+    def label(self) -> str:
+        """The parameter's name."""
+        return self.parameters[0].name
+
+    def __repr__(self) -> str:
+        return f"{self.label} = {self.values[0]:.4g} {self.parameters[0].unit}".rstrip()
+
+    def with_values(self, values: np.ndarray) -> Declared:
+        """As in :class:`Effect`."""
+        clone = object.__new__(Declared)
+        clone.__dict__.update(self.__dict__)
+        p = self.parameters[0]
+        clone.values = np.clip(np.asarray(values, dtype=float), p.lower, p.upper)
+        return clone
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        """Nothing: the name was looked up when it was declared."""
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Write the parameter's field."""
+        self._how.write(world, self.index, x[:, 0], self.nominal)
+
+
+def _find(model: mujoco.MjModel, name: str) -> tuple[str, int, _Kind]:
+    owner, dot, parameter = name.rpartition(".")
+    if not dot:
+        raise ValueError(f"{name!r} is no parameter; write <object>.<parameter>, e.g. 'hinge.damping'")
+    if owner == "option":
+        if parameter not in _OPTIONS:
+            raise ValueError(f"option has no parameter {parameter!r}; {near(parameter, _OPTIONS)}")
+        return "option", 0, _OPTIONS[parameter]
+    prefix, colon, rest = owner.partition(":")
+    if colon and prefix in OBJECTS:
+        candidates, owner = [prefix], rest
+    else:
+        candidates = [kind for kind in OBJECTS if owner in object_names(model, kind)]
+        if not candidates:
+            names = dict.fromkeys(n for kind in OBJECTS for n in object_names(model, kind))
+            raise ValueError(f"{name!r}: the model has no object {owner!r}; {near(owner, names)}")
+    having = [kind for kind in candidates if parameter in _KINDS[kind]]
+    if not having:
+        known = [p for kind in candidates for p in _KINDS[kind]]
+        raise ValueError(
+            f"{name!r}: {' and '.join(candidates)} {owner!r} has no {parameter!r}; {near(parameter, known)}"
+        )
+    if len(having) > 1:
+        raise ValueError(f"{name!r} may be of {' or '.join(having)}; write '{having[0]}:{name}'")
+    index = object_id(model, having[0], owner)
+    if having[0] == "joint" and model.jnt_type[index] not in SCALAR_JOINTS:
+        raise ValueError(f"{name!r}: joint {owner!r} is neither a hinge nor a slide")
+    return having[0], index, _KINDS[having[0]][parameter]
+
+
+def parameter_names(model: mujoco.MjModel) -> list[str]:
+    """Every name that may be declared, one by one."""
+    names = [f"option.{p}" for p in _OPTIONS]
+    for kind in OBJECTS:
+        for i, owner in enumerate(object_names(model, kind)):
+            if (kind == "joint" and model.jnt_type[i] not in SCALAR_JOINTS) or (kind == "body" and i == 0):
+                continue
+            others = [k for k in OBJECTS if k != kind and owner in object_names(model, k)]
+            for p in _KINDS[kind]:
+                clash = any(p in _KINDS[k] for k in others)
+                names.append(f"{kind}:{owner}.{p}" if clash else f"{owner}.{p}")
+    return names
+
+
+def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:
+    """Look up declared parameters.
+
+    :param model: the compiled model
+    :param names: ``<object>.<parameter>``, with shell wildcards (``*.damping``) and bounds (``arm.mass=0.2:0.9``)
+    :return: one :class:`Declared` for each name, in order, none twice
+    :raises ValueError: unknown names (the near ones are said), wildcards that match nothing, malformed bounds
+    """
+    if isinstance(names, str):
+        raise TypeError(f"declared must be a list of names, not the string {names!r}; write [{names!r}]")
+    found: dict[str, Declared] = {}
+    for entry in names:
+        name, equals, given = entry.partition("=")
+        bounds = _bounds(entry, given) if equals else None
+        matches = [name]
+        if any(c in name for c in "*?["):
+            matches = fnmatch.filter(parameter_names(model), name)
+            matches = [m for m in matches if _scalable(model, m)]
+            if not matches:
+                raise ValueError(f"declared {name!r} matches nothing; {near(name, parameter_names(model))}")
+        for match in matches:
+            found[match] = Declared(model, match, bounds)
+    return list(found.values())
+
+
+def _scalable(model: mujoco.MjModel, name: str) -> bool:
+    """Whether a wildcard should match: a factor on zero means nothing."""
+    try:
+        Declared(model, name)
+    except ValueError:
+        return False
+    return True
+
+
+def _bounds(entry: str, given: str) -> tuple[float, float]:
+    try:
+        lower, upper = (float(part) for part in given.split(":"))
+    except ValueError:
+        raise ValueError(f"declared {entry!r}: write bounds as <name>=<lower>:<upper>") from None
+    return lower, upper

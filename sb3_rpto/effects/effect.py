@@ -1,0 +1,194 @@
+"""One hierarchy of effects: what shifts a target, is planted in a test, or corrects a model."""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import mujoco
+import numpy as np
+
+from sb3_rpto.effects.names import SCALAR_JOINTS, near, object_id, object_names
+from sb3_rpto.effects.world import World
+
+Place = Literal["joint", "actuator", "body", "world", "sensor"]
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What is large where an effect sits, from the data: effects of a like size are looked for.
+
+    :param torque: typical peak generalised force of the joint, N·m or N
+    :param velocity: typical peak speed of the joint, rad/s or m/s
+    :param command: typical peak command of the actuator, in its units
+    :param inertia: the joint's inertia, kg·m² or kg
+    :param span: range of positions seen, rad or m
+    :param mass: mass of the body, or of all bodies, kg
+    """
+
+    torque: float = 1.0
+    velocity: float = 1.0
+    command: float = 1.0
+    inertia: float = 1.0
+    span: float = 1.0
+    mass: float = 1.0
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect.
+
+    :param name: short name, e.g. ``"level"``
+    :param unit: SI unit
+    :param size: a plausible small size, where screening looks: a number or a function of :class:`Scales`
+    :param lower: smallest value
+    :param upper: largest value
+    :param null: value at which the effect does nothing; for a shape parameter (any value does) where a fit starts
+    :param shape: True when the parameter means nothing while the others are at their null values
+    """
+
+    name: str
+    unit: str
+    size: float | Callable[[Scales], float]
+    lower: float = -np.inf
+    upper: float = np.inf
+    null: float = 0.0
+    shape: bool = False
+
+    def size_for(self, scales: Scales) -> float:
+        """:attr:`size` where things are as large as ``scales`` says."""
+        return float(self.size(scales) if callable(self.size) else self.size)
+
+
+class Effect(ABC):
+    """Something that a simulation may lack, at one place, with parameters that make it vanish at their null values.
+
+    A subclass states ``kind``, ``place``, ``parameters`` and ``equation`` and overrides one hook: :meth:`write` (a
+    field of the model), :meth:`act` (a force or dry friction in every substep), :meth:`command` (on the signal
+    before the actuators) or :meth:`observe` (on the sensors). Each hook works on ``n`` simulations at once;
+    ``x`` is (n, p), the parameters of each. ``act`` and ``command`` need no more than NumPy.
+
+    :param on: name of the object it sits on, as in the MJCF; none for ``place = "world"``
+    :param values: parameters by name; those not given are at their null value
+    :raises ValueError: unknown parameters, or values outside the bounds
+    """
+
+    kind: ClassVar[str]
+    place: ClassVar[Place]
+    parameters: ClassVar[tuple[Parameter, ...]]
+    equation: ClassVar[str]
+    #: MJCF attribute that holds it in a saved model; empty: the wrapper carries it
+    native: ClassVar[str] = ""
+    #: what sort of experiment would excite it, for "not excited" findings
+    excite: ClassVar[str] = "larger and faster motion"
+    #: where in the chain of command effects it stands; smaller is nearer the controller
+    order: ClassVar[int] = 0
+
+    def __init__(self, on: str = "", **values: float) -> None:
+        names = [p.name for p in self.parameters]
+        for name in values:
+            if name not in names:
+                raise ValueError(f"{self.kind} has no parameter {name!r}; {near(name, names)}")
+        self.on = on
+        self.values = np.array([float(values.get(p.name, p.null)) for p in self.parameters])
+        for p, value in zip(self.parameters, self.values):
+            if not p.lower <= value <= p.upper:
+                raise ValueError(f"{self.kind}: {p.name}={value:g} {p.unit} is outside [{p.lower:g}, {p.upper:g}]")
+
+    @property
+    def label(self) -> str:
+        """``kind(object)``, unique among the effects of a model."""
+        return f"{self.kind}({self.on})" if self.on else self.kind
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{p.name}={v:.4g} {p.unit}".rstrip() for p, v in zip(self.parameters, self.values))
+        return f"{self.label}: {values}"
+
+    def with_values(self, values: np.ndarray) -> Effect:
+        """The same effect with other parameters, (p,), clipped to their bounds."""
+        low, high = ([getattr(p, bound) for p in self.parameters] for bound in ("lower", "upper"))
+        clipped = np.clip(values, low, high)
+        return type(self)(self.on, **{p.name: float(v) for p, v in zip(self.parameters, clipped)})
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Names of the objects of ``model`` on which the effect can sit."""
+        if cls.place == "world":
+            return [""]
+        if cls.place in ("joint", "sensor"):
+            names = object_names(model, "joint")
+            return [names[i] for i in range(model.njnt) if model.jnt_type[i] in SCALAR_JOINTS]
+        if cls.place == "body":
+            return [name for i, name in enumerate(object_names(model, "body")) if i and model.body_mass[i] > 0]
+        return object_names(model, cls.place)
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        """Look up the ids of the place: ``self.dof`` and ``self.adr`` of a joint, ``self.index`` of anything else.
+
+        :raises ValueError: the model has no such object
+        """
+        if self.place in ("joint", "sensor"):
+            joint = object_id(model, "joint", self.on)
+            self.index, self.dof, self.adr = joint, int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
+        elif self.place != "world":
+            self.index = object_id(model, self.place, self.on)
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Change fields of the model, once before a rollout."""
+
+    def act(self, world: World, x: np.ndarray) -> None:
+        """Add to ``world.force`` or ``world.friction``, before every substep."""
+
+    def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
+        """What the actuator receives instead of the command ``u`` (n,), every substep of ``dt`` s.
+
+        :param memory: of this effect, empty before the first step; with delays the past is kept here
+        """
+        return u
+
+    def observe(self, q: np.ndarray, v: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the joint's sensor shows of its position and velocity, all (n, ...) along leading axes."""
+        return q, v
+
+    def unobserve(self, q: np.ndarray, v: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The inverse of :meth:`observe`."""
+        return q, v
+
+    def overrides(self, hook: str) -> bool:
+        """Whether the effect acts by ``hook``."""
+        return getattr(type(self), hook) is not getattr(Effect, hook)
+
+    def to_json(self) -> dict[str, Any]:
+        """Kind, place and values, from which :func:`from_json` makes it again bit for bit."""
+        return {"kind": self.kind, "on": self.on, "values": dict(zip([p.name for p in self.parameters], self.values))}
+
+
+#: Every known effect by kind; :func:`register` adds to it.
+LIBRARY: dict[str, type[Effect]] = {}
+
+
+def register(effect: type[Effect]) -> type[Effect]:
+    """Class decorator: add an effect to the library, so that :func:`sb3_rpto.tracing.trace` looks for it.
+
+    :raises ValueError: the class lacks an attribute, or another effect has its kind
+    """
+    for attribute in ("kind", "place", "parameters", "equation"):
+        if not hasattr(effect, attribute):
+            raise ValueError(f"{effect.__name__} needs a class attribute {attribute!r}; see Effect")
+    known = LIBRARY.get(effect.kind)
+    if known is not None and known.__qualname__ != effect.__qualname__:
+        raise ValueError(f"there is an effect {effect.kind!r} already ({known.__qualname__}); choose another kind")
+    LIBRARY[effect.kind] = effect
+    return effect
+
+
+def from_json(stored: Mapping[str, Any]) -> Effect:
+    """The effect that :meth:`Effect.to_json` described.
+
+    :raises ValueError: no effect of that kind is registered
+    """
+    if stored["kind"] not in LIBRARY:
+        raise ValueError(f"no effect {stored['kind']!r} is registered; {near(stored['kind'], LIBRARY)}")
+    return LIBRARY[stored["kind"]](stored["on"], **stored["values"])

@@ -1,0 +1,203 @@
+"""Many simulations of one model side by side, each with effects of its own strength."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from sb3_rpto.effects.declared import Declared
+from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.names import object_names
+from sb3_rpto.effects.world import BatchWorld, World
+
+
+class Drive(NamedTuple):
+    """What drives ``n`` simulations, on the grid of the model's time step.
+
+    :param commands: (n, before + steps, nu), constant between two steps; the first ``before`` come before the start
+    :param before: steps of commands from before the start, for delays and filters
+    :param enabled: (n, steps, nu), 0 where an actuator is off: no command and no back-EMF; None: always on
+    :param settings: parameters of the model known for each simulation, by declared name, (n,)
+    """
+
+    commands: np.ndarray
+    before: int = 0
+    enabled: np.ndarray | None = None
+    settings: Mapping[str, np.ndarray] = {}
+
+    def take(self, index: np.ndarray) -> Drive:
+        """The drive of the simulations at ``index``, which may repeat."""
+        enabled = None if self.enabled is None else self.enabled[index]
+        return Drive(self.commands[index], self.before, enabled, {k: v[index] for k, v in self.settings.items()})
+
+
+class Simulation:
+    """A compiled model with a list of effects; every rollout says how strong each is in each simulation.
+
+    Nothing is compiled again: parameters are fields of the batch, forces are written in every substep, and commands
+    are transformed before.
+
+    :param model: the nominal model; a copy is kept
+    :param effects: all that may act, declared parameters among them
+    :param nthread: threads of the batch; 0: as many as there are cores
+    """
+
+    def __init__(self, model: mujoco.MjModel, effects: Sequence[Effect], nthread: int = 0) -> None:
+        self.model = model.__copy__()
+        # A simulation that blows up must show, not start anew.
+        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self.effects = list(effects)
+        self.nthread = nthread
+        for effect in self.effects:
+            effect.bind(self.model)
+        ends = np.cumsum([len(e.parameters) for e in self.effects]).astype(int).tolist()
+        self.slices = [slice(end - len(e.parameters), end) for e, end in zip(self.effects, ends)]
+        self.size = ends[-1] if ends else 0
+        self.null = np.array([p.null for e in self.effects for p in e.parameters])
+        #: (p,) False for parameters of shape, which do nothing by themselves
+        self.strength = np.array([not p.shape for e in self.effects for p in e.parameters], dtype=bool)
+        self._settings: dict[str, Declared] = {}
+        self._worlds: dict[int, BatchWorld] = {}
+
+    def values(self) -> np.ndarray:
+        """The effects' own values, (p,)."""
+        return np.concatenate([e.values for e in self.effects]) if self.effects else np.empty(0)
+
+    def rollout(
+        self, values: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, drive: Drive
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Simulate.
+
+        :param values: (n, p), the effects' parameters in each simulation
+        :param qpos: (n, nq), where each starts
+        :param qvel: (n, nv)
+        :param drive: what drives them
+        :return: positions (n, steps + 1, nq) and velocities (n, steps + 1, nv), the start included; NaN after a
+            simulation has become unstable
+        """
+        n, total, _ = drive.commands.shape
+        steps = total - drive.before
+        world = self._world(n)
+        active = [
+            (effect, values[:, s])
+            for effect, s in zip(self.effects, self.slices)
+            if isinstance(effect, Declared) or np.any((values[:, s] != self.null[s])[:, self.strength[s]])
+        ]
+        commands = filter_commands(active, drive.commands, self.model.opt.timestep)[:, drive.before :]
+        world.restore()
+        world.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        for name, setting in drive.settings.items():
+            self._setting(name).write(world, setting[:, None])
+        prepare(world, active)
+        world.qpos[:], world.qvel[:] = qpos, qvel
+        acting = [(e, x) for e, x in active if e.overrides("act")]
+        out_q = np.empty((n, steps + 1, self.model.nq))
+        out_v = np.empty((n, steps + 1, self.model.nv))
+        out_q[:, 0], out_v[:, 0] = qpos, qvel
+        if acting or drive.enabled is not None:
+            switch = Switch(world, drive.enabled)
+            for k in range(steps):
+                world.ctrl[:] = commands[:, k]
+                switch(k)
+                push(world, acting)
+                world.batch.step()
+                out_q[:, k + 1], out_v[:, k + 1] = world.qpos, world.qvel
+        else:
+            world.force[:] = 0
+            world.friction[:] = 0
+            world.commit()
+            record = world.batch.rollout(steps, commands, record=("qpos", "qvel"))
+            out_q[:, 1:], out_v[:, 1:] = record["qpos"], record["qvel"]
+        bad = ~(np.isfinite(out_q).all(-1) & (np.abs(out_v) < 1e6).all(-1))
+        if bad.any():
+            bad = np.maximum.accumulate(bad, axis=1)
+            out_q[bad], out_v[bad] = np.nan, np.nan
+        return out_q, out_v
+
+    def _world(self, n: int) -> BatchWorld:
+        if n not in self._worlds:
+            if len(self._worlds) >= 4:
+                self._worlds.pop(next(iter(self._worlds)))
+            self._worlds[n] = BatchWorld(self.model, n, self.nthread)
+        return self._worlds[n]
+
+    def _setting(self, name: str) -> Declared:
+        if name not in self._settings:
+            self._settings[name] = Declared(self.model, name, (-np.inf, np.inf))
+        return self._settings[name]
+
+
+Active = Sequence[tuple[Effect, np.ndarray]]
+
+
+def prepare(world: World, active: Active) -> None:
+    """Write what the effects change of the model: numbers that were declared first, additions after."""
+    for effect, x in sorted(active, key=lambda pair: not isinstance(pair[0], Declared)):
+        effect.write(world, x)
+    for effect, _ in active:
+        # Dry friction that varies goes through the solver too, so its joint must be ready for it.
+        if effect.overrides("act") and effect.place == "joint":
+            world.rough(effect.dof)
+    world.settle()
+
+
+def push(world: World, acting: Active) -> None:
+    """Collect and apply the forces of one substep."""
+    world.force[:] = 0
+    world.friction[:] = 0
+    for effect, x in acting:
+        effect.act(world, x)
+    world.commit()
+
+
+def filter_commands(active: Active, commands: np.ndarray, dt: float) -> np.ndarray:
+    """Send commands (n, steps, nu) through the effects between controller and actuators, in their order."""
+    chain = sorted((pair for pair in active if pair[0].overrides("command")), key=lambda pair: pair[0].order)
+    if not chain:
+        return commands
+    out = commands.copy()
+    for effect, x in chain:
+        memory: dict[str, Any] = {}
+        column = out[:, :, effect.index]
+        for k in range(column.shape[1]):
+            column[:, k] = effect.command(column[:, k], x, memory, dt)
+    return out
+
+
+class Switch:
+    """Turns actuators off where ``enabled`` is 0: no command, no servo, no back-EMF."""
+
+    FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_damping", "actuator_dampingpoly")
+
+    def __init__(self, world: BatchWorld, enabled: np.ndarray | None) -> None:
+        self.world, self.enabled = world, enabled
+        if enabled is not None:
+            self.on = {name: world.field(name).copy() for name in self.FIELDS}
+            self.last = np.ones_like(enabled[:, 0])
+
+    def __call__(self, k: int) -> None:
+        """Set the actuators of step ``k``."""
+        if self.enabled is None or np.array_equal(self.enabled[:, k], self.last):
+            return
+        self.last = self.enabled[:, k]
+        for name, on in self.on.items():
+            mask = self.last.reshape(*self.last.shape, *[1] * (on.ndim - 2))
+            self.world.field(name)[:] = on * mask
+        # The damping of actuators reaches the joints through derived constants.
+        self.world.batch.set_const()
+
+
+def names_of(model: mujoco.MjModel, qpos: Sequence[str]) -> np.ndarray:
+    """Addresses in qpos of columns named after joints (``root.2`` for a coordinate of a free joint), (m,)."""
+    joints = object_names(model, "joint")
+    addresses = []
+    for name in qpos:
+        joint, _, offset = name.rpartition(".")
+        if joint in joints and offset.isdigit():
+            addresses.append(int(model.jnt_qposadr[joints.index(joint)]) + int(offset))
+        else:
+            addresses.append(int(model.jnt_qposadr[joints.index(name)]))
+    return np.array(addresses, dtype=int)

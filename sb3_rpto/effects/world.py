@@ -1,0 +1,134 @@
+"""What an effect sees and moves: many simulations of one model side by side, or the one of an environment."""
+
+from abc import ABC, abstractmethod
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+#: Fields whose change asks for mj_setConst, and MjOption fields that do not.
+_DERIVING = frozenset(mujoco.MjModel._setconst_inputs)
+
+
+class World(ABC):
+    """``n`` simulations of one model, as arrays whose first axis is the simulation.
+
+    State arrays are live: what the physics moves shows in them. ``force`` and ``friction`` are collected from the
+    effects in every substep, then written at once.
+
+    :param model: the nominal model; its fields are never written through the world of a batch
+    :param n: number of simulations
+    """
+
+    qpos: np.ndarray  # (n, nq)
+    qvel: np.ndarray  # (n, nv)
+    ctrl: np.ndarray  # (n, nu)
+    time: np.ndarray  # (n,)
+    actuation: np.ndarray  # (n, nv), the actuators' generalised force in the substep before
+
+    def __init__(self, model: mujoco.MjModel, n: int) -> None:
+        self.model = model
+        self.n = n
+        self.force = np.zeros((n, model.nv))  # N·m or N, added to the generalised forces
+        self.friction = np.zeros((n, model.nv))  # N·m or N, added to the level of dry friction
+        self._nominal: dict[str, np.ndarray] = {}
+
+    @abstractmethod
+    def _live(self, name: str) -> np.ndarray:
+        """The (n, ...) live values of a model field."""
+
+    def field(self, name: str) -> np.ndarray:
+        """A model field's values for each simulation, (n, ...), to write to; ``"opt.gravity"`` for an option.
+
+        :meth:`restore` brings the nominal values back.
+        """
+        if name not in self._nominal:
+            self._nominal[name] = self._live(name)[:1].copy()
+        return self._live(name)
+
+    def restore(self) -> None:
+        """Give every field that was written its nominal values again."""
+        for name, values in self._nominal.items():
+            self._live(name)[:] = values
+
+    def settle(self) -> None:
+        """Derive the constants that follow from the fields, and keep the level of dry friction."""
+        if any(name in _DERIVING for name in self._nominal):
+            self._set_const()
+        if "dof_frictionloss" in self._nominal:
+            self._base_friction = self._live("dof_frictionloss").copy()
+
+    @abstractmethod
+    def _set_const(self) -> None:
+        """mj_setConst in every simulation."""
+
+    def rough(self, dof: int) -> None:
+        """Make a joint ready for dry friction that holds: the stiffest constraint that the time step allows.
+
+        MuJoCo's default lets a loaded joint creep at up to about a tenth of a radian a second.
+        """
+        self.field("dof_frictionloss")
+        self.field("dof_solref")[:, dof] = (2 * self.model.opt.timestep, 1.0)
+        self.field("dof_solimp")[:, dof] = (0.99, 0.99, 0.001, 0.5, 2.0)
+
+    def commit(self) -> None:
+        """Write the collected ``force`` and ``friction`` to the physics."""
+        self._applied()[:] = self.force
+        if "dof_frictionloss" in self._nominal:
+            np.maximum(self._base_friction + self.friction, 0.0, out=self._live("dof_frictionloss"))
+
+    @abstractmethod
+    def _applied(self) -> np.ndarray:
+        """The (n, nv) live qfrc_applied."""
+
+
+class BatchWorld(World):
+    """``n`` simulations on the threads of a :class:`mujoco.batch.Batch`."""
+
+    def __init__(self, model: mujoco.MjModel, n: int, nthread: int = 0) -> None:
+        super().__init__(model, n)
+        self.batch = Batch(model, n, nthread)
+        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self.ctrl, self.time = self.batch.bind("ctrl"), self.batch.bind("time")
+        self.actuation = self.batch.bind("qfrc_actuator")
+
+    def _live(self, name: str) -> np.ndarray:
+        return self.batch.expand(name)
+
+    def _set_const(self) -> None:
+        self.batch.set_const()
+
+    def _applied(self) -> np.ndarray:
+        return self.batch.bind("qfrc_applied")
+
+
+class LiveWorld(World):
+    """The one simulation of an environment; writes go to its own model and data.
+
+    :param data: the environment's data
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        super().__init__(model, 1)
+        self.data = data
+        self.qpos, self.qvel, self.ctrl = data.qpos[None], data.qvel[None], data.ctrl[None]
+        self.actuation = data.qfrc_actuator[None]
+
+    @property
+    def time(self) -> np.ndarray:  # type: ignore[override]
+        """Simulated time in s, (1,)."""
+        return np.array([self.data.time])
+
+    def _live(self, name: str) -> np.ndarray:
+        owner = self.model.opt if name.startswith("opt.") else self.model
+        values = getattr(owner, name.removeprefix("opt."))
+        if not isinstance(values, np.ndarray):
+            raise ValueError(f"{name} is not an array; it cannot be written in place")
+        return values[None]
+
+    def _set_const(self) -> None:
+        # mj_setConst writes the data at the reference pose: a scratch copy keeps the environment where it is.
+        mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+
+    def _applied(self) -> np.ndarray:
+        return self.data.qfrc_applied[None]
