@@ -23,13 +23,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecEnv, V
 Rule = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
 
 # Wrappers that pass observations, actions and rewards on unchanged; by name, since a subprocess tells no more.
-_HARMLESS = {
+HARMLESS_WRAPPERS = {
     *("TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "Autoreset", "Monitor", "RecordEpisodeStatistics"),
     *("RecordVideo", "RenderCollection", "HumanRendering", "DynamicsEnv"),
 }
 # The action of the buffer is not the one that the task's reward sees; its termination does not mind.
 _CHANGES_ACTIONS = {"ClipAction", "RescaleAction"}
-_HARMLESS_VEC = (VecNormalize, VecMonitor, VecCheckNan)  # VecNormalize: buffers hold raw data
+HARMLESS_VEC_WRAPPERS = (VecNormalize, VecMonitor, VecCheckNan)  # VecNormalize: buffers hold raw data
 
 
 class TaskRules(NamedTuple):
@@ -52,7 +52,7 @@ def task_rules(env: gym.Env | VecEnv) -> TaskRules:
     """
     inner = env
     while isinstance(inner, VecEnvWrapper):
-        if not isinstance(inner, _HARMLESS_VEC):
+        if not isinstance(inner, HARMLESS_VEC_WRAPPERS):
             return TaskRules(None, None)
         inner = inner.venv
     view = _View(inner)
@@ -125,7 +125,7 @@ class _View:
 def _known_task(view: _View) -> TaskRules:
     """The rules of a gymnasium task, or none."""
     find = _TASKS.get(_task_name(view) or "")
-    if find is None or not view.understood or not view.wrappers <= (_HARMLESS | _CHANGES_ACTIONS):
+    if find is None or not view.understood or not view.wrappers <= (HARMLESS_WRAPPERS | _CHANGES_ACTIONS):
         return TaskRules(None, None)
     try:
         rules = find(view)
