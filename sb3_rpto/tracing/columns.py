@@ -1,9 +1,15 @@
 """The columns of a table of measurements: which are there, what they stand for, in which order they are kept."""
 
+from __future__ import annotations
+
 import difflib
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import mujoco
 
 PLAIN = ("episode", "time", "split")
 PREFIXES = ("qpos", "qvel", "ctrl", "qfrc", "enabled", "param")
@@ -32,6 +38,23 @@ class Columns:
 def joint_of(name: str) -> str:
     """Joint of a coordinate: ``root`` for ``root.3``, the name itself for a scalar joint."""
     return re.sub(r"\.\d$", "", name)
+
+
+def columns_of(model: mujoco.MjModel) -> Columns:
+    """Columns of the full state and all commands of a model, in the model's order.
+
+    Joints and actuators without a name are called ``joint0``, ``actuator0`` … by their index.
+
+    :param model: whose names are used; ball and free joints have numbered coordinates
+    """
+    qpos: list[str] = []
+    qvel: list[str] = []
+    for j in range(model.njnt):
+        name, size = model.joint(j).name or f"joint{j}", len(model.joint(j).qpos0)
+        for names, count in ((qpos, size), (qvel, {7: 6, 4: 3, 1: 1}[size])):
+            names += [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
+    ctrl = [model.actuator(a).name or f"actuator{a}" for a in range(model.nu)]
+    return Columns(tuple(qpos), tuple(qvel), tuple(ctrl), (), (), ())
 
 
 def read_columns(names: Iterable[str], file: str) -> Columns:

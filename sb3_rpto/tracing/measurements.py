@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,11 @@ from sb3_rpto.tracing import checks
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.columns import Columns, joint_of, read_columns
 from sb3_rpto.tracing.episodes import PARTS, Episode, Table, read_run, repair, runs_of
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+    from stable_baselines3.common.buffers import ReplayBuffer
+    from stable_baselines3.common.vec_env import VecEnv
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -123,6 +128,39 @@ class Measurements:
                 f"{first}: no stretch between gaps has {checks.MIN_ROWS} rows; record longer or drop fewer samples"
             )
         return cls(episodes, columns, findings)
+
+    @classmethod
+    def from_replay(cls, buffer: "ReplayBuffer", env: "gym.Env | VecEnv", *, exact: bool = True) -> "Measurements":
+        """Read the transitions of an SB3 replay buffer, of a :class:`~sb3_rpto.DualReplayBuffer` those of the target.
+
+        Observations are mapped back to states (:func:`sb3_rpto.envs.observations.state_map`), actions to the commands
+        of the actuators. An episode ends at a done or a time limit, and where no transition begins at the last one's
+        next observation, which is its last sample (the command there repeats the one before). Time is counted in
+        ``env.unwrapped.dt``. A position that no observation holds (the x of a walker) is integrated from its velocity
+        and listed in :attr:`unobserved`; a sample with a speed at the observation's bound is not ``usable``.
+
+        :param buffer: of vector observations, any number of environments, raw (not normalised), actions scaled to
+            [-1, 1] as SB3 stores them
+        :param env: the environment, with the wrappers that it had; it is neither reset nor stepped
+        :param exact: whether the transitions come from a simulator; False for a machine behind the same observations
+        :raises ValueError: no MuJoCo model, states that cannot be recovered, NaN, no episode of two transitions
+        """
+        from sb3_rpto.tracing.replay import from_replay
+
+        return from_replay(buffer, env, exact)
+
+    @classmethod
+    def from_minari(cls, dataset: Any, env: "gym.Env | VecEnv | None" = None) -> "Measurements":
+        """Read a Minari dataset of a MuJoCo environment, as :meth:`from_replay` does; its samples count as exact.
+
+        :param dataset: a ``minari.MinariDataset``, or the id of one that is stored locally
+        :param env: the environment of the data; None: the one that the dataset recovers
+        :raises ImportError: minari is not installed
+        :raises ValueError: as there
+        """
+        from sb3_rpto.tracing.replay import from_minari
+
+        return from_minari(dataset, env)
 
     def tables(self) -> dict[str, np.ndarray]:
         """All samples as one table of columns of shape (sum of T,), in the file format, for any writer.
