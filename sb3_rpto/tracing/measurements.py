@@ -71,7 +71,7 @@ class Measurements:
         try:
             import pandas
         except ImportError as error:
-            message = "reading Parquet needs pandas and pyarrow: pip install 'sb3-rpto[experiments]' pyarrow"
+            message = "reading Parquet needs pandas and pyarrow: pip install 'sb3-rpto[experiments,data]'"
             raise ImportError(message) from error
         frames = {path: pandas.read_parquet(path) for path in _expand(paths)}
         return cls.from_tables({p: {name: f[name].to_numpy() for name in f.columns} for p, f in frames.items()})
