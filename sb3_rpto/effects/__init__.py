@@ -1,8 +1,9 @@
 """The physics that a world may contain: what shifts a target, is planted in a test, or corrects a model."""
 
-from sb3_rpto.effects import friction  # noqa: F401  (registers its effects)
+from sb3_rpto.effects import bodies, commands, forces, friction, sensors  # noqa: F401  (they register their effects)
 from sb3_rpto.effects.declared import Declared, declare, parameter_names
 from sb3_rpto.effects.effect import LIBRARY, Effect, Parameter, Scales, from_json, register
+from sb3_rpto.effects.library import candidates
 from sb3_rpto.effects.simulation import Drive, Simulation
 from sb3_rpto.effects.world import World
 
@@ -15,6 +16,7 @@ __all__ = [
     "Scales",
     "Simulation",
     "World",
+    "candidates",
     "declare",
     "from_json",
     "parameter_names",

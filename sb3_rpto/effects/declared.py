@@ -161,7 +161,8 @@ class Declared(Effect):
     equation = "a number of the model"
 
     def __init__(self, model: mujoco.MjModel, name: str, bounds: tuple[float, float] | None = None) -> None:
-        self._where, self.index, self._how = _find(model, name)
+        #: kind of object it belongs to, or ``option``
+        self.owner, self.index, self._how = _find(model, name)
         how = self._how
         nominal = how.read(model, self.index)
         if how.span is not None and nominal == 0:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -13,7 +12,7 @@ import numpy as np
 from sb3_rpto.effects.names import SCALAR_JOINTS, near, object_id, object_names
 from sb3_rpto.effects.world import World
 
-Place = Literal["joint", "actuator", "body", "world", "sensor"]
+Place = Literal["joint", "actuator", "body", "geom", "world", "sensor"]
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class Parameter:
         return float(self.size(scales) if callable(self.size) else self.size)
 
 
-class Effect(ABC):
+class Effect:
     """Something that a simulation may lack, at one place, with parameters that make it vanish at their null values.
 
     A subclass states ``kind``, ``place``, ``parameters`` and ``equation`` and overrides one hook: :meth:`write` (a
@@ -83,6 +82,8 @@ class Effect(ABC):
     native: ClassVar[str] = ""
     #: what sort of experiment would excite it, for "not excited" findings
     excite: ClassVar[str] = "larger and faster motion"
+    #: declared parameters of the same object that are the same number, e.g. ``("damping",)``
+    same: ClassVar[tuple[str, ...]] = ()
     #: where in the chain of command effects it stands; smaller is nearer the controller
     order: ClassVar[int] = 0
 
@@ -121,7 +122,8 @@ class Effect(ABC):
             names = object_names(model, "joint")
             return [names[i] for i in range(model.njnt) if model.jnt_type[i] in SCALAR_JOINTS]
         if cls.place == "body":
-            return [name for i, name in enumerate(object_names(model, "body")) if i and model.body_mass[i] > 0]
+            names = object_names(model, "body")
+            return [names[i] for i in range(model.nbody) if model.body_weldid[i] and model.body_mass[i] > 0]
         return object_names(model, cls.place)
 
     def bind(self, model: mujoco.MjModel) -> None:

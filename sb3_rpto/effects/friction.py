@@ -1,23 +1,32 @@
 """Friction in a joint."""
 
+import mujoco
 import numpy as np
 
-from sb3_rpto.effects.effect import Effect, Parameter, register
+from sb3_rpto.effects.actuation import drivers, joint_torque, motors
+from sb3_rpto.effects.effect import Effect, Parameter, Scales, register
+from sb3_rpto.effects.names import hinges, object_names
 from sb3_rpto.effects.world import World
+
+
+def _torque(scales: Scales) -> float:
+    return 0.03 * scales.torque
 
 
 @register
 class CoulombFriction(Effect):
-    r"""Dry friction of constant level, holding at rest: :math:`|\tau_f| \le F_c`, and :math:`-F_c\,\mathrm{sign}(\dot q)` in motion.
+    r"""Dry friction of constant level (Coulomb 1785): :math:`-F_c\,\mathrm{sign}(\dot q)`, holding up to :math:`F_c`.
 
     MuJoCo's frictionloss, with the stiffest constraint that the time step allows.
     """
 
     kind = "coulomb_friction"
     place = "joint"
-    parameters = (Parameter("level", "N·m", lambda s: 0.03 * s.torque, lower=0.0),)
+    parameters = (Parameter("level", "N·m", _torque, lower=0.0),)
     equation = "-level sign(qd)"
     native = "frictionloss"
+    excite = "motion that often reverses, at small and at large speed"
+    same = ("frictionloss",)
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Add to frictionloss."""
@@ -35,13 +44,152 @@ class StribeckFriction(Effect):
     kind = "stribeck_friction"
     place = "joint"
     parameters = (
-        Parameter("extra", "N·m", lambda s: 0.03 * s.torque, lower=0.0),
-        Parameter("level", "N·m", lambda s: 0.03 * s.torque, lower=0.0),
+        Parameter("extra", "N·m", _torque, lower=0.0),
+        Parameter("level", "N·m", _torque, lower=0.0),
         Parameter("speed", "rad/s", lambda s: 0.1 * s.velocity, lower=1e-3, null=0.3, shape=True),
     )
     equation = "-(level + extra exp(-(qd/speed)^2)) sign(qd)"
+    excite = "slow motion and motion that starts from rest"
 
     def act(self, world: World, x: np.ndarray) -> None:
         """Raise the level of dry friction."""
         v = world.qvel[:, self.dof] / x[:, 2]
         world.friction[:, self.dof] += x[:, 1] + x[:, 0] * np.exp(-(v**2))
+
+
+@register
+class ViscousFriction(Effect):
+    r"""Friction proportional to speed, :math:`-c\,\dot q`: MuJoCo's ``damping``, integrated implicitly."""
+
+    kind = "viscous_friction"
+    place = "joint"
+    parameters = (Parameter("coefficient", "N·m·s/rad", lambda s: _torque(s) / s.velocity, lower=0.0),)
+    equation = "-coefficient qd"
+    native = "damping"
+    excite = "motion at several speeds"
+    same = ("damping",)
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Add to damping."""
+        world.field("dof_damping")[:, self.dof] += x[:, 0]
+
+
+@register
+class QuadraticDrag(Effect):
+    r"""Drag of a turbulent flow, :math:`-c\,|\dot q|\,\dot q`.
+
+    MuJoCo's ``dof_dampingpoly`` (:math:`-(d + p_0 |\dot q| + p_1 \dot q^2)\,\dot q`, first coefficient).
+    """
+
+    kind = "quadratic_drag"
+    place = "joint"
+    parameters = (Parameter("coefficient", "N·m·s²/rad²", lambda s: _torque(s) / s.velocity**2, lower=0.0),)
+    equation = "-coefficient |qd| qd"
+    native = "damping"
+    excite = "fast motion"
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Add to the damping polynomial."""
+        world.field("dof_dampingpoly")[:, self.dof, 0] += x[:, 0]
+
+
+@register
+class AsymmetricDamping(Effect):
+    r"""Viscous friction that depends on the direction: :math:`-c_+ \max(\dot q, 0) - c_- \min(\dot q, 0)`."""
+
+    kind = "asymmetric_damping"
+    place = "joint"
+    parameters = (
+        Parameter("forward", "N·m·s/rad", lambda s: _torque(s) / s.velocity, lower=0.0),
+        Parameter("backward", "N·m·s/rad", lambda s: _torque(s) / s.velocity, lower=0.0),
+    )
+    equation = "-forward max(qd, 0) - backward min(qd, 0)"
+    excite = "motion at several speeds in both directions"
+
+    def act(self, world: World, x: np.ndarray) -> None:
+        """Add the torque."""
+        v = world.qvel[:, self.dof]
+        world.force[:, self.dof] -= x[:, 0] * np.maximum(v, 0.0) + x[:, 1] * np.minimum(v, 0.0)
+
+
+class _LoadDependent(Effect):
+    """Friction that grows with what the motors put on the joint."""
+
+    place = "joint"
+    excite = "large and small torques at the same speed"
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Joints that a motor drives."""
+        names = object_names(model, "joint")
+        driven = {names[joint] for joint in range(model.njnt) if drivers(model, joint)}
+        return [name for name in super().places(model) if name in driven]
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        """As in :class:`Effect`; looks up the motors too."""
+        super().bind(model)
+        self.motors = motors(model, self.index)
+
+    def torque(self, world: World) -> np.ndarray:
+        """The motors' torque at the joint, (n,)."""
+        return joint_torque(world, self.motors, self.dof, self.adr)
+
+
+@register
+class LoadFriction(_LoadDependent):
+    r"""Dry friction that grows with the load of a gear: :math:`F = \mu\,|\tau_m|` (Bittencourt & Gunnarsson 2012)."""
+
+    kind = "load_friction"
+    parameters = (Parameter("mu", "", 0.03, lower=0.0, upper=1.0),)
+    equation = "-mu |tau_motor| sign(qd)"
+
+    def act(self, world: World, x: np.ndarray) -> None:
+        """Raise the level of dry friction."""
+        world.friction[:, self.dof] += x[:, 0] * np.abs(self.torque(world))
+
+
+@register
+class DirectionalLoadFriction(_LoadDependent):
+    r"""Load-dependent friction that differs when the motor drives the load and when the load drives the motor.
+
+    :math:`F = \mu_d |\tau_m|` while :math:`\tau_m \dot q > 0`, else :math:`F = \mu_b |\tau_m|`: the two efficiencies of
+    a gear (Duclusaud et al. 2025). A gear at rest is driven by its load.
+    """
+
+    kind = "directional_load_friction"
+    parameters = (
+        Parameter("mu_driving", "", 0.03, lower=0.0, upper=1.0),
+        Parameter("mu_driven", "", 0.03, lower=0.0, upper=1.0),
+    )
+    equation = "-(mu_driving if tau_motor qd > 0 else mu_driven) |tau_motor| sign(qd)"
+    excite = "accelerating and braking with large torques"
+
+    def act(self, world: World, x: np.ndarray) -> None:
+        """Raise the level of dry friction."""
+        torque = self.torque(world)
+        mu = np.where(torque * world.qvel[:, self.dof] > 0, x[:, 0], x[:, 1])
+        world.friction[:, self.dof] += mu * np.abs(torque)
+
+
+@register
+class PositionFriction(Effect):
+    r"""Dry friction that varies over a turn, as of a bent shaft: :math:`F = A\,(1 + \cos(q - \varphi)) / 2`."""
+
+    kind = "position_friction"
+    place = "joint"
+    parameters = (
+        Parameter("amplitude", "N·m", _torque, lower=0.0),
+        Parameter("phase", "rad", 0.5, lower=-np.pi, upper=np.pi, shape=True),
+    )
+    equation = "-amplitude (1 + cos(q - phase))/2 sign(qd)"
+    excite = "slow motion over a whole turn"
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Hinges."""
+        return hinges(model)
+
+    def act(self, world: World, x: np.ndarray) -> None:
+        """Raise the level of dry friction."""
+        q = world.qpos[:, self.adr]
+        world.friction[:, self.dof] += x[:, 0] * (1 + np.cos(q - x[:, 1])) / 2

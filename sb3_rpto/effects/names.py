@@ -34,6 +34,12 @@ def object_id(model: mujoco.MjModel, kind: str, name: str) -> int:
     return names.index(name)
 
 
+def hinges(model: mujoco.MjModel) -> list[str]:
+    """Names of the hinges."""
+    names = object_names(model, "joint")
+    return [names[i] for i in range(model.njnt) if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE]
+
+
 def near(name: str, known: Iterable[str]) -> str:
     """What to say after an unknown name: the near ones, or all when there are few."""
     known = list(known)

@@ -113,6 +113,7 @@ class LiveWorld(World):
         self.data = data
         self.qpos, self.qvel, self.ctrl = data.qpos[None], data.qvel[None], data.ctrl[None]
         self.actuation = data.qfrc_actuator[None]
+        self._numbers: dict[str, np.ndarray] = {}  # options that are plain numbers: written here, then to the model
 
     @property
     def time(self) -> np.ndarray:  # type: ignore[override]
@@ -123,8 +124,22 @@ class LiveWorld(World):
         owner = self.model.opt if name.startswith("opt.") else self.model
         values = getattr(owner, name.removeprefix("opt."))
         if not isinstance(values, np.ndarray):
-            raise ValueError(f"{name} is not an array; it cannot be written in place")
+            return self._numbers.setdefault(name, np.array([float(values)]))
         return values[None]
+
+    def restore(self) -> None:
+        """As in :class:`World`."""
+        super().restore()
+        self._write_numbers()
+
+    def settle(self) -> None:
+        """As in :class:`World`."""
+        self._write_numbers()
+        super().settle()
+
+    def _write_numbers(self) -> None:
+        for name, value in self._numbers.items():
+            setattr(self.model.opt, name.removeprefix("opt."), value.item())
 
     def _set_const(self) -> None:
         # mj_setConst writes the data at the reference pose: a scratch copy keeps the environment where it is.

@@ -1,0 +1,77 @@
+"""The torque that motors put on a joint, now: what depends on load needs it before the substep."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from sb3_rpto.effects.world import World
+
+_GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
+_BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
+_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+
+
+def memoryless(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator's force follows from its command and its joint alone: no activation, delay or tendon."""
+    return bool(
+        model.actuator_trntype[actuator] in _JOINT
+        and model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
+        and model.actuator_gaintype[actuator] in _GAINS
+        and model.actuator_biastype[actuator] in _BIASES
+        and not np.any(model.actuator_delay[actuator])
+    )
+
+
+def drivers(model: mujoco.MjModel, joint: int) -> list[int]:
+    """The actuators that act on a joint itself, not through a tendon or a site."""
+    return [a for a in range(model.nu) if model.actuator_trntype[a] in _JOINT and model.actuator_trnid[a, 0] == joint]
+
+
+def motors(model: mujoco.MjModel, joint: int) -> list[int] | None:
+    """The actuators on a joint; None where what they do cannot be told from their commands."""
+    on = drivers(model, joint)
+    through_tendons = any(model.actuator_trntype[a] not in _JOINT for a in range(model.nu))
+    return None if through_tendons or not all(memoryless(model, a) for a in on) else on
+
+
+def motor_torque(world: World, actuator: int, dof: int, adr: int) -> np.ndarray:
+    r"""Generalised force of a memoryless actuator at its joint, N·m or N, (n,).
+
+    :math:`\tau = G\,\mathrm{clip}(g\,\mathrm{clip}(u) + b_0 + b_1 l + b_2 \dot l)` with gear :math:`G`, length
+    :math:`l = G q` and gain :math:`g = g_0 + g_1 l + g_2 \dot l` (MuJoCo documentation, *Actuation model*).
+
+    :param world: commands and state of the substep to come
+    :param actuator: id of the actuator, see :func:`memoryless`
+    :param dof: the joint's address in qvel
+    :param adr: its address in qpos
+    """
+    model = world.model
+    gear = world.field("actuator_gear")[:, actuator, 0]
+    length, speed = gear * world.qpos[:, adr], gear * world.qvel[:, dof]
+    u = world.ctrl[:, actuator]
+    if model.actuator_ctrllimited[actuator]:
+        limits = world.field("actuator_ctrlrange")[:, actuator]
+        u = np.clip(u, limits[:, 0], limits[:, 1])
+    force = _affine(world.field("actuator_gainprm")[:, actuator], length, speed) * u
+    if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
+        force = force + _affine(world.field("actuator_biasprm")[:, actuator], length, speed)
+    if model.actuator_forcelimited[actuator]:
+        limits = world.field("actuator_forcerange")[:, actuator]
+        force = np.clip(force, limits[:, 0], limits[:, 1])
+    return gear * force
+
+
+def joint_torque(world: World, actuators: list[int] | None, dof: int, adr: int) -> np.ndarray:
+    """Sum of the actuators' generalised forces at a joint, (n,); that of the substep before where they have memory.
+
+    :param actuators: from :func:`motors`
+    """
+    if actuators is None:
+        return world.actuation[:, dof]
+    return sum((motor_torque(world, a, dof, adr) for a in actuators), np.zeros(world.n))
+
+
+def _affine(parameters: np.ndarray, length: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    # A fixed gain has zeros for the terms in length and speed.
+    return parameters[:, 0] + parameters[:, 1] * length + parameters[:, 2] * speed

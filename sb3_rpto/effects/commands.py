@@ -1,0 +1,136 @@
+"""What happens to a command on its way to the actuator, in this order: delay, deadband, gain, saturation, play, lag."""
+
+from typing import Any
+
+import numpy as np
+
+from sb3_rpto.effects.effect import Effect, Parameter, register
+
+_LONGEST = 0.2  # s; a longer delay is a fault of the log
+
+
+@register
+class CommandDelay(Effect):
+    r"""The actuator receives :math:`u(t - d)`.
+
+    A command is constant between two grid points, so the mean over a step of the delayed one is exactly the linear
+    interpolation between two past samples. Before the first sample its command is held.
+    """
+
+    kind = "command_delay"
+    place = "actuator"
+    parameters = (Parameter("delay", "s", 0.01, lower=0.0, upper=_LONGEST),)
+    equation = "u(t - delay)"
+    native = "delay"
+    excite = "commands that change quickly"
+    order = 0
+
+    def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
+        """Read the past at the delay."""
+        if not memory:
+            depth = int(np.ceil(_LONGEST / dt)) + 2
+            memory["past"], memory["k"] = np.repeat(u[:, None], depth, axis=1), -1
+        past = memory["past"]
+        depth = past.shape[1]
+        k = memory["k"] = (memory["k"] + 1) % depth
+        past[:, k] = u
+        steps = x[:, 0] / dt
+        whole = np.floor(steps).astype(int)
+        rows, part = np.arange(len(u)), steps - whole
+        return (1 - part) * past[rows, (k - whole) % depth] + part * past[rows, (k - whole - 1) % depth]
+
+
+@register
+class CommandDeadband(Effect):
+    r"""A dead zone, :math:`u - \mathrm{clip}(u, -w, w)`: nothing below :math:`w`, and all above is less by it."""
+
+    kind = "command_deadband"
+    place = "actuator"
+    parameters = (Parameter("width", "command", lambda s: 0.05 * s.command, lower=0.0),)
+    equation = "u - clip(u, -width, width)"
+    excite = "small commands"
+    order = 1
+
+    def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
+        """Take the dead zone away."""
+        return u - np.clip(u, -x[:, 0], x[:, 0])
+
+
+@register
+class CommandGain(Effect):
+    r"""A wrong gain of the amplifier: :math:`(1 + g)\,u`."""
+
+    kind = "command_gain"
+    place = "actuator"
+    parameters = (Parameter("change", "", 0.03, lower=-0.9, upper=9.0),)
+    equation = "(1 + change) u"
+    native = "gainprm"
+    excite = "large commands"
+    order = 2
+    same = ("gain", "gear", "strength")
+
+    def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
+        """Scale."""
+        return u * (1 + x[:, 0])
+
+
+@register
+class CommandSaturation(Effect):
+    r"""A limit of the amplifier, :math:`\mathrm{clip}(u, -1/s, 1/s)`, by its inverse: 0 is no limit."""
+
+    kind = "command_saturation"
+    place = "actuator"
+    parameters = (Parameter("inverse_limit", "1/command", lambda s: 1.2 / s.command, lower=0.0),)
+    equation = "clip(u, -1/inverse_limit, 1/inverse_limit)"
+    native = "ctrlrange"
+    excite = "the largest commands"
+    order = 3
+
+    def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
+        """Clip."""
+        limit = np.divide(1.0, x[:, 0], out=np.full(len(u), np.inf), where=x[:, 0] > 0)
+        return np.clip(u, -limit, limit)
+
+
+@register
+class Backlash(Effect):
+    r"""Play between command and actuator, of half-width h: :math:`y = \mathrm{clip}(y^-, u - h, u + h)`.
+
+    The play operator (Krasnosel'skii & Pokrovskii 1989), which starts at the first command. It is that of a stiff
+    drive that moves a servo's target; the impacts of gears on their teeth are not in it.
+    """
+
+    kind = "backlash"
+    place = "actuator"
+    parameters = (Parameter("half_width", "command", lambda s: 0.05 * s.command, lower=0.0),)
+    equation = "y = clip(y, u - half_width, u + half_width)"
+    excite = "commands that often reverse"
+    order = 4
+
+    def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
+        """Follow the command at the edge of the play."""
+        memory["y"] = np.clip(memory.get("y", u), u - x[:, 0], u + x[:, 0])
+        return memory["y"]
+
+
+@register
+class ActuatorLag(Effect):
+    r"""First-order lag :math:`T \dot y = u - y`, exact for a command held over the step, starting at the first command.
+
+    The same as MuJoCo's ``dyntype="filterexact"`` with ``actearly``.
+    """
+
+    kind = "actuator_lag"
+    place = "actuator"
+    parameters = (Parameter("time_constant", "s", 0.01, lower=0.0, upper=2.0),)
+    equation = "time_constant dy/dt = u - y"
+    native = "dyntype"
+    excite = "commands that change quickly"
+    order = 5
+
+    def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
+        """Filter."""
+        # Written this way the null, where the past has no weight, gives u without rounding.
+        keep = np.exp(-dt / np.maximum(x[:, 0], 1e-12))
+        memory["y"] = u + (memory.get("y", u) - u) * keep
+        return memory["y"]

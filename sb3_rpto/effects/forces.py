@@ -1,0 +1,137 @@
+"""Torques at a joint that no friction makes: motors and springs."""
+
+import mujoco
+import numpy as np
+
+from sb3_rpto.effects.actuation import memoryless, motor_torque
+from sb3_rpto.effects.effect import Effect, Parameter, register
+from sb3_rpto.effects.names import SCALAR_JOINTS, hinges, object_names
+from sb3_rpto.effects.world import World
+
+
+@register
+class TorqueRipple(Effect):
+    r"""Cogging with :math:`n` periods a turn, :math:`a \cos(n q) + b \sin(n q)` (Holtz & Springob 1996)."""
+
+    kind = "torque_ripple"
+    place = "joint"
+    parameters = (
+        Parameter("cosine", "N·m", lambda s: 0.03 * s.torque),
+        Parameter("sine", "N·m", lambda s: 0.03 * s.torque),
+        Parameter("turns", "1/rev", 1.0, lower=1.0, upper=48.0, null=6.0, shape=True),
+    )
+    equation = "cosine cos(turns q) + sine sin(turns q)"
+    excite = "slow motion over a whole turn, in both directions"
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Hinges."""
+        return hinges(model)
+
+    def act(self, world: World, x: np.ndarray) -> None:
+        """Add the torque."""
+        angle = x[:, 2] * world.qpos[:, self.adr]
+        world.force[:, self.dof] += x[:, 0] * np.cos(angle) + x[:, 1] * np.sin(angle)
+
+
+@register
+class TorqueOffset(Effect):
+    """A constant torque, as of a biased amplifier or a cable that pulls: the same in both directions."""
+
+    kind = "torque_offset"
+    place = "joint"
+    parameters = (Parameter("offset", "N·m", lambda s: 0.03 * s.torque),)
+    equation = "offset"
+    excite = "rest or slow motion at several poses"
+
+    def act(self, world: World, x: np.ndarray) -> None:
+        """Add the torque."""
+        world.force[:, self.dof] += x[:, 0]
+
+
+@register
+class Spring(Effect):
+    r"""A linear spring (Hooke 1678), :math:`-k\,(q - q_0)`: MuJoCo's ``stiffness`` and ``springref``.
+
+    Beside the model's own spring :math:`(k_1, r_1)` it is held exactly by :math:`k_1 + k` about
+    :math:`(k_1 r_1 + k q_0) / (k_1 + k)`.
+    """
+
+    kind = "spring"
+    place = "joint"
+    parameters = (
+        Parameter("stiffness", "N·m/rad", lambda s: 0.03 * s.torque / s.span, lower=0.0),
+        Parameter("reference", "rad", lambda s: 0.3 * s.span, shape=True),
+    )
+    equation = "-stiffness (q - reference)"
+    native = "stiffness"
+    excite = "positions far from each other, held or slowly passed"
+    same = ("stiffness",)
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Hinges and slides whose own spring, if any, is linear."""
+        names = object_names(model, "joint")
+        return [n for n in super().places(model) if not model.jnt_stiffnesspoly[names.index(n)].any()]
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Add to the joint's own spring."""
+        stiffness = world.field("jnt_stiffness")[:, self.index]
+        reference = world.field("qpos_spring")[:, self.adr]
+        total = stiffness + x[:, 0]
+        # With no stiffness at all the reference means nothing and stays.
+        share = np.divide(x[:, 0], total, out=np.zeros_like(total), where=total > 0)
+        reference += share * (x[:, 1] - reference)
+        stiffness += x[:, 0]
+
+
+@register
+class DCMotor(Effect):
+    r"""Torque-speed limit of a motor: at its voltage limit back-EMF takes away torque in proportion to the speed.
+
+    :math:`|\tau| \le \tau_s (1 - |\dot q| / \omega_0)` while driving (:math:`\tau \dot q > 0`), and
+    :math:`|\tau| \le \tau_s` while braking, with the stall torque :math:`\tau_s = 1 /` ``inverse_stall`` and the
+    no-load speed :math:`\omega_0 = 1 /` ``inverse_speed``, both at the joint: the torque-speed line of a DC motor
+    (Hughes & Drury 2013) with its current limit. Zero stands for no limit.
+    """
+
+    kind = "dc_motor"
+    place = "actuator"
+    parameters = (
+        Parameter("inverse_stall", "1/(N·m)", lambda s: 1.2 / s.torque, lower=0.0),
+        Parameter("inverse_speed", "s/rad", lambda s: 1.2 / s.velocity, lower=0.0),
+    )
+    equation = "|tau| <= (1 - inverse_speed |qd| [tau qd > 0]) / inverse_stall"
+    excite = "full torque at high speed"
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Actuators on a hinge or slide without activation, delay or tendon."""
+        names = object_names(model, "actuator")
+        return [
+            names[a]
+            for a in range(model.nu)
+            if memoryless(model, a) and model.jnt_type[model.actuator_trnid[a, 0]] in SCALAR_JOINTS
+        ]
+
+    def bind(self, model: mujoco.MjModel) -> None:
+        """As in :class:`Effect`; looks up the joint too.
+
+        :raises ValueError: the actuator is not on a hinge or slide, or has activation or delay
+        """
+        super().bind(model)
+        if self.on not in self.places(model):
+            raise ValueError(
+                f"dc_motor cannot sit on {self.on!r}: it needs a motor on a hinge or slide, without memory"
+            )
+        joint = model.actuator_trnid[self.index, 0]
+        self.dof, self.adr = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
+
+    def act(self, world: World, x: np.ndarray) -> None:
+        """Take away what the motor cannot give."""
+        torque = motor_torque(world, self.index, self.dof, self.adr)
+        speed = world.qvel[:, self.dof]
+        driving = np.where(torque * speed > 0, np.abs(speed), 0.0)
+        room = np.maximum(1 - x[:, 1] * driving, 0.0)
+        limit = np.divide(room, x[:, 0], out=np.where(room > 0, np.inf, 0.0), where=x[:, 0] > 0)
+        world.force[:, self.dof] -= torque - np.clip(torque, -limit, limit)
