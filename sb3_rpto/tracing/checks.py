@@ -76,18 +76,20 @@ def unwrap(angle: np.ndarray) -> tuple[np.ndarray, int]:
     return angle - turn * np.concatenate([[0.0], np.cumsum(jumps)]), count
 
 
-def smoothed_velocity(time: np.ndarray, position: np.ndarray) -> np.ndarray:
+def smoothed_velocity(time: np.ndarray, position: np.ndarray, window: int = WINDOW) -> np.ndarray:
     """Differentiate a position on the run's own clock with a cubic Savitzky-Golay filter.
 
     Position and time are both differentiated by sample number, and dq/dt = (dq/di) / (dt/di): so a jittered clock
     counts with its true times and nothing is resampled.
 
     :param time: increasing times in s, shape (T,) with T >= 5
-    :param position: in rad or m, shape (T,)
-    :return: velocity in rad/s or m/s, shape (T,)
+    :param position: in rad or m, shape (T,) or (T, n)
+    :param window: odd number of samples, >= 5; cut to the length of the run
+    :return: velocity in rad/s or m/s, shape as ``position``
     """
-    window = min(WINDOW, len(time) - (len(time) + 1) % 2)
-    return savgol_filter(position, window, 3, deriv=1) / savgol_filter(time, window, 3, deriv=1)
+    window = min(window, len(time) - (len(time) + 1) % 2)
+    by_sample = savgol_filter(position, window, 3, deriv=1, axis=0)
+    return (by_sample.T / savgol_filter(time, window, 3, deriv=1)).T
 
 
 def quantum(velocity: np.ndarray) -> float | None:

@@ -45,7 +45,8 @@ def columns_of(model: mujoco.MjModel) -> Columns:
 
     Joints and actuators without a name are called ``joint0``, ``actuator0`` … by their index.
 
-    :param model: whose names are used; ball and free joints have numbered coordinates
+    :param model: whose names are used; ball and free joints have numbered coordinates, and so do actuators that take
+        several commands
     """
     qpos: list[str] = []
     qvel: list[str] = []
@@ -53,7 +54,10 @@ def columns_of(model: mujoco.MjModel) -> Columns:
         name, size = model.joint(j).name or f"joint{j}", len(model.joint(j).qpos0)
         for names, count in ((qpos, size), (qvel, {7: 6, 4: 3, 1: 1}[size])):
             names += [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
-    ctrl = [model.actuator(a).name or f"actuator{a}" for a in range(model.nu)]
+    ctrl: list[str] = []
+    for a, count in enumerate(model.actuator_ctrlnum):
+        name = model.actuator(a).name or f"actuator{a}"
+        ctrl += [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
     return Columns(tuple(qpos), tuple(qvel), tuple(ctrl), (), (), ())
 
 

@@ -1,0 +1,268 @@
+"""What can be wrong between a model and the recordings of the machine that it stands for."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from scipy.ndimage import binary_erosion
+from scipy.signal import savgol_filter
+
+from sb3_rpto.tracing.checks import WINDOW, Finding, smoothed_velocity
+from sb3_rpto.tracing.columns import columns_of, joint_of
+from sb3_rpto.tracing.measurements import Measurements
+
+ALL = "all episodes"
+SLOW = 0.02
+"""A machine sampled at longer steps than this, in s, is said to be sampled slowly."""
+LAG = 2
+"""A response that is later than this many samples is reported."""
+SMOOTHING = 0.06
+"""Time that the filter of noisy recordings spans, in s."""
+_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # the first of the scalar ones
+_LIMIT = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)  # the first of limits and contacts
+_ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_MAX_LAG = 25
+_FEWEST = 30
+_BUDGET = 40_000  # samples in all: about two seconds for a small robot
+_STRONG = 0.5  # correlation that counts
+_CERTAIN = 0.7  # and where no other run is there to compare with
+_GAIN = 0.1  # by which a lag must improve it
+_SLOPE = 3.0  # needed and commanded force agree within this factor; a spring that the model lacks reverses them too
+
+
+def check_against(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
+    """Check recordings against the model that is to explain them.
+
+    Looked at: the names, the sampling, and by inverse dynamics of the smoothed motion whether each joint's actuators
+    act when and in the direction that they are told. Samples in contact, at a joint's limit, with an actuator switched
+    off, or not usable say nothing about the latter and are left out.
+
+    :param model: of the machine
+    :param data: recordings, their names as in the model; the order of the columns does not matter
+    :return: what was found, nothing is repaired
+    :raises ValueError: joints or actuators that are not in both, or a wrong number of coordinates; the message names
+        the nearest names
+    """
+    check_names(model, data)
+    return _sampling(model, data) + _responses(model, data)
+
+
+def check_names(model: mujoco.MjModel, data: Measurements) -> None:
+    """Require that data and model have the same joints and actuators.
+
+    :raises ValueError: see :func:`check_against`
+    """
+    own, given = columns_of(model), data.columns
+    for what, prefix, theirs, ours in (
+        ("joint", "qpos", given.qpos, own.qpos),
+        ("actuator", "ctrl", given.ctrl, own.ctrl),
+    ):
+        names, known = (list(dict.fromkeys(map(joint_of, columns))) for columns in (theirs, ours))
+        for name in names:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=2, cutoff=0.5)
+                hint = (
+                    f"did you mean {' or '.join(map(repr, near))}?" if near else f"it has {', '.join(known) or 'none'}"
+                )
+                raise ValueError(f"column '{prefix}.{name}': the model has no {what} {name!r}; {hint}")
+        for name in known:
+            expected, found = ([c for c in columns if joint_of(c) == name] for columns in (ours, theirs))
+            if not found:
+                raise ValueError(
+                    f"the model's {what} {name!r} has no column '{prefix}.{expected[0]}'; "
+                    + (
+                        "record it or take the joint out of the model"
+                        if prefix == "qpos"
+                        else "add it, 0 where at rest"
+                    )
+                )
+            if sorted(found) != sorted(expected):
+                raise ValueError(
+                    f"{what} {name!r} has the columns {', '.join(found)}, the model needs {', '.join(expected)}"
+                )
+
+
+def _sampling(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
+    if not data.episodes:
+        return []
+    found = []
+    step, timestep = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes]))), model.opt.timestep
+    whole = max(1, round(step / timestep)) * timestep
+    if abs(step - whole) > 0.01 * step:
+        message = (
+            f"the median step of {step:.4g} s is no whole multiple of the model's timestep of {timestep:.4g} s; "
+            f"one of {step / max(1, np.ceil(step / timestep)):.6g} s would be"
+        )
+        found.append(Finding("sampling", f"{ALL}, time", message))
+    if step > 1.01 * SLOW and not data.exact:
+        message = f"the median step is {step:.4g} s; effects faster than that, such as a short delay, leave no trace"
+        found.append(Finding("slow sampling", f"{ALL}, time", message))
+    return found
+
+
+# --- responses ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Force:
+    """Two forces on one joint that should agree, in one recording, through the same filter."""
+
+    run: str
+    where: str
+    needed: np.ndarray  # by the motion, (T,)
+    given: np.ndarray  # commanded or measured, (T,)
+    clear: np.ndarray  # (T,), bool: nothing else is in the way
+
+
+def _responses(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
+    """Late or reversed forces, judged by the correlation of what moves a joint with what it was told."""
+    forces: dict[str, dict[str, list[_Force]]] = {}
+    for force in _forces(model, data):
+        forces.setdefault(force.where, {}).setdefault(force.run, []).append(force)
+    found = []
+    for where, runs in forces.items():
+        correlations = {run: c for run, parts in runs.items() if (c := _correlate(parts)) is not None}
+        if not correlations:
+            continue
+        strength = np.mean([np.abs(c[0]) for c in correlations.values()], axis=0)
+        lag = int(np.argmax(strength))
+        right = np.mean([c[0][lag] > 0 and 1 / _SLOPE <= c[1][lag] <= _SLOPE for c in correlations.values()])
+        if lag > LAG and right > 0.5 and strength[lag] >= max(_CERTAIN, strength[0] + _GAIN):
+            step = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
+            message = (
+                f"the motion follows about {lag} samples ({lag * step:.3g} s) late: a delay or lag in the actuator, or "
+                "channels that were not recorded at the same time"
+            )
+            found.append(Finding("late response", f"{ALL}, {where}", message))
+        else:
+            lag = int(np.argmax(strength[: LAG + 1]))
+        found += _signs(where, {run: (c[0][lag], c[1][lag]) for run, c in correlations.items()})
+    return found
+
+
+def _signs(where: str, fits: dict[str, tuple[float, float]]) -> list[Finding]:
+    """Runs whose correlation and slope speak for a flipped sign."""
+    flipped = [run for run, (c, slope) in fits.items() if c <= -_STRONG and -_SLOPE <= slope <= -1 / _SLOPE]
+    right = [run for run, (c, _) in fits.items() if c >= _STRONG]
+    mean = np.mean([c for c, _ in fits.values()])
+    if len(flipped) == len(fits) and mean <= -_CERTAIN:
+        message = (
+            f"in every run the motion needs the opposite force (correlation {mean:.2f}): "
+            "its sign is flipped, or the model lacks a force larger than those it has; kept as it is"
+        )
+        return [Finding("flipped sign", f"{ALL}, {where}", message)]
+    if not right:
+        return []
+    message = "here, unlike in other runs, the motion needs the opposite force (correlation {:.2f}); kept as it is"
+    return [Finding("flipped sign", f"{run}, {where}", message.format(fits[run][0])) for run in flipped]
+
+
+def _correlate(parts: list[_Force]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Correlation, and slope of needed against given force, by lag in samples; None where there is too little."""
+    correlations, slopes = np.zeros(_MAX_LAG + 1), np.zeros(_MAX_LAG + 1)
+    for lag in range(_MAX_LAG + 1):
+        pairs = [
+            (p.needed[lag:][p.clear[lag:]], p.given[: len(p.given) - lag][p.clear[lag:]])
+            for p in parts
+            if len(p.given) > 3 * lag
+        ]
+        needed, given = (np.concatenate(x) for x in zip(*pairs)) if pairs else (np.empty(0), np.empty(0))
+        spread = np.std(given) if len(given) else 0.0
+        if len(given) < _FEWEST or spread <= 1e-9 * (1 + np.abs(given).max()) or np.std(needed) == 0:
+            if lag == 0:
+                return None
+            continue
+        correlations[lag] = np.corrcoef(needed, given)[0, 1]
+        slopes[lag] = correlations[lag] * np.std(needed) / spread
+    return correlations, slopes
+
+
+def _forces(model: mujoco.MjModel, data: Measurements) -> Iterator[_Force]:
+    own = columns_of(model)
+    order = {
+        name: [getattr(data.columns, name).index(n) for n in getattr(own, name)] for name in ("qpos", "qvel", "ctrl")
+    }
+    budget = max(500, _BUDGET // max(1, len({e.run for e in data.episodes})))
+    spent: dict[str, int] = {}
+    for episode in data.episodes:
+        rows = slice(0, budget - spent.get(episode.run, 0))
+        n = len(episode.time[rows])
+        if n < _FEWEST:
+            continue
+        spent[episode.run] = spent.get(episode.run, 0) + n
+        time = episode.time[rows]
+        step = float(np.median(np.diff(time)))
+        window = 5 if data.exact else int(np.clip(SMOOTHING / step, WINDOW, 101)) // 2 * 2 + 1
+        qpos, qvel = episode.qpos[rows][:, order["qpos"]], episode.qvel[rows][:, order["qvel"]]
+        qacc = smoothed_velocity(time, qvel, window)
+        if not data.exact:
+            size = min(window, n - (n + 1) % 2)
+            qpos, qvel = (savgol_filter(array, size, 3, axis=0) for array in (qpos, qvel))
+        inverse, free = _inverse(model, qpos, qvel, qacc)
+        ctrl = episode.ctrl[rows][:, order["ctrl"]]
+        idle = _actuation(model, time, qpos, qvel, np.zeros_like(ctrl))
+        told = _actuation(model, time, qpos, qvel, ctrl) - idle
+        usable = free & episode.usable[rows] & episode.enabled[rows].all(axis=1)
+        clear = binary_erosion(usable, np.ones(window), border_value=1)
+        for j in np.flatnonzero(model.jnt_type >= _SLIDE).tolist():
+            dof = model.jnt_dofadr[j]
+            if np.any(told[:, dof]):
+                given = _through(time, told[:, dof], window)
+                yield _Force(episode.run, _label(model, j), (inverse - idle)[:, dof], given, clear)
+            name = own.qvel[dof]
+            if name in data.columns.qfrc:
+                measured = episode.qfrc[rows][:, data.columns.qfrc.index(name)]
+                yield _Force(episode.run, f"qfrc.{name}", inverse[:, dof], _through(time, measured, window), clear)
+
+
+def _label(model: mujoco.MjModel, joint: int) -> str:
+    on_joint = np.isin(model.actuator_trntype, _ON_JOINT)
+    actuators = np.flatnonzero(on_joint & (model.actuator_trnid[:, 0] == joint))
+    names = [columns_of(model).ctrl[model.actuator_ctrladr[a]] for a in actuators]
+    return f"ctrl.{names[0]}" if len(names) == 1 else f"commands on {columns_of(model).qvel[model.jnt_dofadr[joint]]}"
+
+
+def _through(time: np.ndarray, force: np.ndarray, window: int) -> np.ndarray:
+    """A force as the filter of the acceleration shows it: held from sample to sample, integrated, differentiated."""
+    impulse = np.concatenate([[0.0], np.cumsum(force[:-1] * np.diff(time))])
+    return smoothed_velocity(time, impulse, window)
+
+
+def _inverse(
+    model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, qacc: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Forces that a motion needs beyond the model's passive ones, (T, nv), and where no contact or limit acts, (T,)."""
+    data = mujoco.MjData(model)
+    forces, free = np.empty((len(qpos), model.nv)), np.empty(len(qpos), dtype=bool)
+    for k in range(len(qpos)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = qpos[k], qvel[k], qacc[k]
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        mujoco.mj_inverse(model, data)
+        forces[k] = data.qfrc_inverse
+        free[k] = not np.any(data.efc_type >= _LIMIT)
+    return forces, free
+
+
+def _actuation(
+    model: mujoco.MjModel, time: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray
+) -> np.ndarray:
+    """Generalised forces of the model's actuators along a given motion, (T, nv)."""
+    data = mujoco.MjData(model)
+    forces = np.empty((len(qpos), model.nv))
+    # Actuators with a memory are led along the motion by the simulator's own steps.
+    substeps = max(1, round(float(np.median(np.diff(time))) / model.opt.timestep)) if model.na or model.nhistory else 0
+    for k in range(len(qpos)):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[k], qvel[k], ctrl[k]
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        if substeps:
+            mujoco.mj_step(model, data, substeps)
+        else:
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            mujoco.mj_fwdActuation(model, data)
+        forces[k] = data.qfrc_actuator
+    return forces

@@ -1,0 +1,187 @@
+import mujoco
+import numpy as np
+import pytest
+
+from sb3_rpto.tracing import Measurements
+from sb3_rpto.tracing.model_checks import check_against
+
+ARM = """<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body><joint name="shoulder" axis="0 1 0" damping="0.05"/>
+      <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5" contype="0" conaffinity="0"/>
+      <body pos="0 0 -0.3"><joint name="elbow" axis="0 1 0" damping="0.02"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.2" mass="0.2" contype="0" conaffinity="0"/></body>
+    </body>
+  </worldbody>
+  <actuator>ACTUATORS</actuator>
+</mujoco>"""
+KINDS = {
+    "motor": '<motor name="first" joint="shoulder" gear="2"/><motor name="second" joint="elbow"/>',
+    "servo": '<position name="first" joint="shoulder" kp="8" kv="0.3"/><position name="second" joint="elbow" kp="2"/>',
+    "lag": "".join(
+        f'<general name="{name}" joint="{joint}" gainprm="2" dyntype="filterexact" dynprm="0.05" actearly="true"/>'
+        for name, joint in (("first", "shoulder"), ("second", "elbow"))
+    ),
+}
+
+
+def model_of(kind="motor", **options):
+    xml = ARM.replace("ACTUATORS", KINDS[kind])
+    for name, value in options.items():
+        xml = xml.replace('timestep="0.002"', f'timestep="0.002" {name}="{value}"')
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def simulate(model, run, n=400, substeps=5, delay=0, noise=1e-3, hold=4):
+    """Held random commands; the machine receives them ``delay`` samples late."""
+    rng = np.random.default_rng(run)
+    ctrl = np.repeat(rng.uniform(-0.6, 0.6, (n // hold, model.nu)), hold, axis=0)
+    data = mujoco.MjData(model)
+    rows = []
+    for k in range(n):
+        # The last step's force, as a torque sensor would show it.
+        rows.append((data.qpos.copy(), data.qvel.copy()))
+        data.ctrl[:] = ctrl[k - delay] if k >= delay else 0
+        mujoco.mj_step(model, data, substeps)
+    qpos, qvel = (np.array(x) for x in zip(*rows))
+    qpos, qvel = qpos + noise * rng.normal(size=qpos.shape), qvel + 5 * noise * rng.normal(size=qvel.shape)
+    table = {"time": substeps * model.opt.timestep * np.arange(n)}
+    for i, joint in ((1, "elbow"), (0, "shoulder")):  # not in the model's order
+        table |= {f"qpos.{joint}": qpos[:, i], f"qvel.{joint}": qvel[:, i]}
+    return table | {"ctrl.second": ctrl[:, 1], "ctrl.first": ctrl[:, 0]}
+
+
+def measured(model, runs=3, **kwargs):
+    return {f"run{i}": simulate(model, i, **kwargs) for i in range(runs)}
+
+
+def found(model, tables):
+    return [(f.kind, f.where) for f in check_against(model, Measurements.from_tables(tables))]
+
+
+@pytest.mark.parametrize("noise", [1e-5, 1e-3, 5e-3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_clean_recordings_have_no_findings(kind, noise):
+    model = model_of(kind)
+    assert found(model, measured(model, noise=noise)) == []
+
+
+def test_recordings_of_a_heavier_and_rougher_machine_have_none():
+    machine = model_of()
+    machine.body_mass[1:] *= 1.5
+    machine.body_inertia[1:] *= 1.5
+    machine.dof_frictionloss[:] = 0.1
+    assert found(model_of(), measured(machine)) == []
+
+
+@pytest.mark.parametrize("kind", ["motor", "servo", "lag"])
+def test_a_command_flipped_in_one_run(kind):
+    model = model_of(kind)
+    tables = measured(model)
+    tables["run1"]["ctrl.second"] *= -1
+    assert found(model, tables) == [("flipped sign", "run1, ctrl.second")]
+
+
+def test_a_command_flipped_in_all_runs():
+    model = model_of()
+    tables = measured(model)
+    for table in tables.values():
+        table["ctrl.first"] *= -1
+    data = Measurements.from_tables(tables)
+    (finding,) = check_against(model, data)
+    assert (finding.kind, finding.where) == ("flipped sign", "all episodes, ctrl.first")
+    assert "in every run" in finding.message
+
+
+def with_torque(tables):
+    for table in tables.values():
+        table["qfrc.elbow"] = table["ctrl.second"].copy()
+    return tables
+
+
+def test_a_measured_torque():
+    model = model_of()
+    tables = with_torque(measured(model))
+    assert found(model, tables) == []
+    tables["run2"]["qfrc.elbow"] *= -1
+    assert found(model, tables) == [("flipped sign", "run2, qfrc.elbow")]
+
+
+@pytest.mark.parametrize("delay", [5, 9])
+def test_a_late_response_is_measured_in_samples(delay):
+    model = model_of()
+    findings = check_against(model, Measurements.from_tables(measured(model, delay=delay)))
+    assert sorted((f.kind, f.where) for f in findings) == [
+        ("late response", "all episodes, ctrl.first"),
+        ("late response", "all episodes, ctrl.second"),
+    ]
+    assert all(f"about {delay} samples ({delay * 0.01:.3g} s)" in f.message for f in findings)
+
+
+def test_a_late_and_flipped_command():
+    model = model_of()
+    tables = measured(model, delay=6)
+    tables["run0"]["ctrl.first"] *= -1
+    assert ("flipped sign", "run0, ctrl.first") in found(model, tables)
+
+
+def test_samples_that_are_switched_off_or_not_usable_do_not_count():
+    model = model_of()
+    tables = measured(model, n=800)
+    off = np.arange(800) < 750
+    for table in tables.values():
+        table["ctrl.first"] = np.where(off, -table["ctrl.first"], table["ctrl.first"])
+        table["enabled.first"] = (~off).astype(float)
+    assert found(model, tables) == []
+    for table in tables.values():
+        del table["enabled.first"]
+    data = Measurements.from_tables(tables)
+    assert [f.kind for f in check_against(model, data)] == ["flipped sign"]
+    for episode in data.episodes:
+        episode.usable[:] = ~off
+    assert check_against(model, data) == []
+
+
+def test_the_step_must_be_a_multiple_of_the_timestep():
+    model = model_of()
+    tables = measured(model)
+    coarse = model_of()
+    coarse.opt.timestep = 0.003
+    (finding,) = check_against(coarse, Measurements.from_tables(tables))
+    assert (finding.kind, finding.where) == ("sampling", "all episodes, time")
+    assert "0.0025 s" in finding.message
+    coarse.opt.timestep = 0.02  # a timestep longer than the step is no multiple either
+    assert ("sampling", "all episodes, time") in found(coarse, tables)
+
+
+def test_a_machine_that_is_sampled_slowly():
+    model = model_of()
+    tables = measured(model, substeps=20, hold=8)
+    assert found(model, tables) == [("slow sampling", "all episodes, time")]
+
+
+def test_names_that_the_model_has_not():
+    model = model_of()
+    table = simulate(model, 0)
+
+    def check(rename, match):
+        renamed = {rename.get(name, name): values for name, values in table.items() if rename.get(name, name)}
+        with pytest.raises(ValueError, match=match):
+            check_against(model, Measurements.from_tables({"run": renamed}))
+
+    check({"qpos.elbow": "qpos.elbo", "qvel.elbow": "qvel.elbo"}, r"no joint 'elbo'; did you mean 'elbow'")
+    check({"ctrl.first": "ctrl.fist"}, r"no actuator 'fist'; did you mean 'first'")
+    check({"ctrl.first": "ctrl.zz"}, r"no actuator 'zz'; it has first, second")
+    check({"qpos.elbow": "", "qvel.elbow": ""}, r"joint 'elbow' has no column 'qpos.elbow'; record it")
+    check({"ctrl.first": ""}, r"actuator 'first' has no column 'ctrl.first'; add it")
+
+
+def test_a_ball_joint_is_no_hinge():
+    ball = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="elbow" type="ball"/><geom size="0.1"/></body></worldbody></mujoco>'
+    )
+    time = np.arange(10) * 0.01
+    data = Measurements.from_tables({"run": {"time": time, "qpos.elbow": np.sin(time)}})
+    with pytest.raises(ValueError, match=r"has the columns elbow, the model needs elbow.0, elbow.1"):
+        check_against(ball, data)
