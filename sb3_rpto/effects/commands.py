@@ -21,7 +21,6 @@ class CommandDelay(Effect):
     place = "actuator"
     parameters = (Parameter("delay", "s", 0.01, lower=0.0, upper=_LONGEST),)
     equation = "u(t - delay)"
-    native = "delay"
     excite = "commands that change quickly"
     order = 0
 
@@ -64,7 +63,6 @@ class CommandGain(Effect):
     place = "actuator"
     parameters = (Parameter("change", "", 0.03, lower=-0.9, upper=9.0),)
     equation = "(1 + change) u"
-    native = "gainprm"
     excite = "large commands"
     order = 2
     same = ("gain", "gear", "strength")
@@ -82,7 +80,6 @@ class CommandSaturation(Effect):
     place = "actuator"
     parameters = (Parameter("inverse_limit", "1/command", lambda s: 1.2 / s.command, lower=0.0),)
     equation = "clip(u, -1/inverse_limit, 1/inverse_limit)"
-    native = "ctrlrange"
     excite = "the largest commands"
     order = 3
 
@@ -124,7 +121,6 @@ class ActuatorLag(Effect):
     place = "actuator"
     parameters = (Parameter("time_constant", "s", 0.01, lower=0.0, upper=2.0),)
     equation = "time_constant dy/dt = u - y"
-    native = "dyntype"
     excite = "commands that change quickly"
     order = 5
 
