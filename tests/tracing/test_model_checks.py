@@ -75,6 +75,12 @@ def test_recordings_of_a_heavier_and_rougher_machine_have_none():
     assert found(model_of(), measured(machine)) == []
 
 
+def test_a_spring_that_the_model_lacks_is_no_flipped_sign():
+    machine = model_of()  # below its resonance the acceleration goes against the command
+    machine.jnt_stiffness.reshape(machine.njnt, -1)[:, 0] = 3.0
+    assert found(model_of(), measured(machine)) == []
+
+
 @pytest.mark.parametrize("kind", ["motor", "servo", "lag"])
 def test_a_command_flipped_in_one_run(kind):
     model = model_of(kind)
