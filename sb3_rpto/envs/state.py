@@ -60,8 +60,9 @@ def save_state(env: VecEnv) -> dict[str, Any] | None:
     """Take a snapshot of the simulations, random streams, wrappers and buffers of ``env``.
 
     Known are DummyVecEnv within VecNormalize and VecMonitor, the wrappers that gymnasium.make and SB3 put around
-    environments, gymnasium's MuJoCo tasks, Pendulum, MountainCarContinuous and every environment that offers
-    ``get_state()`` and ``set_state(state)``. Clocks and open files are left out.
+    environments, wrappers whose class names the attributes that change (``state_attributes``), gymnasium's MuJoCo
+    tasks, Pendulum, MountainCarContinuous and every environment that offers ``get_state()`` and ``set_state(state)``.
+    Clocks and open files are left out.
 
     :param env: the environment, untouched
     :return: plain data that pickles, or None when any layer is unknown
@@ -171,6 +172,8 @@ def _save_env(env: gym.Env) -> dict[str, Any]:
 def _wrapper_state(layer: gym.Env) -> tuple[str, ...] | None:
     if type(layer) in _WRAPPERS:
         return _WRAPPERS[type(layer)]  # type: ignore[index]
+    if hasattr(type(layer), "state_attributes"):
+        return type(layer).state_attributes  # type: ignore[attr-defined]
     # A wrapper that holds nothing of its own has nothing to save.
     own = vars(layer).keys() - vars(gym.Wrapper(gym.Env())).keys() - {"_saved_kwargs"}
     return None if own else ()
@@ -213,8 +216,8 @@ def _restore_simulation(base: gym.Env, saved: dict[str, Any]) -> None:
 # --- trial copies -----------------------------------------------------------------------------------------------
 
 
-def copy_env(env: VecEnv) -> gym.Env | None:
-    """Copy the first environment of ``env`` with all its wrappers, to try things without touching the original.
+def copy_env(env: VecEnv | gym.Env) -> gym.Env | None:
+    """Copy an environment (of a VecEnv the first) with all its wrappers, to try things without touching the original.
 
     The copy draws no pictures and writes no files. (Python's own deep copy of a gymnasium MuJoCo task makes a new
     one from the constructor's arguments, which loses every later change of the model.)
@@ -222,11 +225,11 @@ def copy_env(env: VecEnv) -> gym.Env | None:
     :param env: the environment, untouched
     :return: the copy, or None when it cannot be made (subprocesses, contents that do not copy)
     """
-    base = env.unwrapped
-    if not isinstance(base, DummyVecEnv):
+    base = env if isinstance(env, gym.Env) else env.unwrapped
+    if not isinstance(base, gym.Env | DummyVecEnv):
         return None
     try:
-        return _clone(base.envs[0], {})
+        return _clone(base if isinstance(base, gym.Env) else base.envs[0], {})
     except Exception:  # whatever the contents of a user's environment raise when copied
         return None
 

@@ -1,0 +1,195 @@
+"""Corrected simulators in a folder: ``model.xml``, which MuJoCo loads, and ``effects.json``, which makes it exact."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+
+from sb3_rpto.effects.declared import Declared
+from sb3_rpto.effects.effect import LIBRARY, Effect, from_json
+from sb3_rpto.effects.mjcf import write_mjcf
+from sb3_rpto.effects.model import ModelSource, load_model, numbers, same_layout, set_number
+from sb3_rpto.effects.names import near
+from sb3_rpto.effects.simulation import Simulation, prepare
+from sb3_rpto.effects.world import LiveWorld
+from sb3_rpto.effects.wrapper import CorrectedEnv, active, is_corrected, own
+
+FORMAT = 1
+_HOOKS = ("act", "command", "observe")
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """A corrected simulator.
+
+    :param model: with the numbers of every effect that MJCF can hold
+    :param effects: all effects, as changes of the **nominal** model; those for which :func:`carried_by` says
+        ``"mjcf"`` are in ``model`` already
+    """
+
+    model: mujoco.MjModel
+    effects: list[Effect]
+
+    def simulation(self, nthread: int = 0) -> Simulation:
+        """Many of it side by side; its effects, and :meth:`Simulation.values`, are those that MJCF cannot hold.
+
+        :param nthread: threads; 0: as many as there are cores
+        """
+        return Simulation(self.model, [e for e in self.effects if carried_by(e) == "wrapper"], nthread)
+
+    def apply(self, env: gym.Env) -> CorrectedEnv:
+        """Put all effects into ``env``, which must have the nominal model.
+
+        :param env: a gymnasium MuJoCo environment; it is changed. :func:`sb3_rpto.envs.corrected.apply_effects` with
+            :attr:`effects` leaves it alone
+        """
+        return CorrectedEnv(env, self.effects)
+
+
+def carried_by(effect: Effect) -> Literal["mjcf", "wrapper"]:
+    """Where an effect is kept in a saved simulator: in the MJCF's numbers, or in the simulation around it."""
+    return "wrapper" if any(map(effect.overrides, _HOOKS)) else "mjcf"
+
+
+def correct(model: mujoco.MjModel, effects: Sequence[Effect]) -> mujoco.MjModel:
+    """A copy of the nominal model with the effects that are numbers of it.
+
+    :raises ValueError: the model lacks an object that an effect sits on
+    """
+    model = model.__copy__()
+    numeric = [effect for effect in own(effects, model) if carried_by(effect) == "mjcf"]
+    prepare(LiveWorld(model, mujoco.MjData(model)), active(numeric))
+    return model
+
+
+def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects: Sequence[Effect]) -> None:
+    """Save the simulator that ``effects`` make of the nominal model.
+
+    MuJoCo writes six digits to an MJCF, so ``effects.json`` holds the exact value of every number that the MJCF
+    compiles to something else. Meshes, textures and height fields are copied beside it (``assets/``).
+
+    :param folder: made if missing; what else is in it stays. A crash leaves either state, or a torn one that
+        :func:`load_corrected` refuses
+    :param source: the nominal model, see :func:`~sb3_rpto.effects.model.load_model`; not an MjModel alone
+    :param effects: with their values
+    :raises ValueError: nothing tells the MJCF of ``source``, or it has effects already
+    :raises FileNotFoundError: an asset is missing
+    """
+    if isinstance(source, gym.Env) and is_corrected(source):
+        raise ValueError("source has effects already; give the nominal model, or the environment as it was before")
+    spec, nominal = load_model(source)
+    if spec is None:
+        raise ValueError(
+            f"nothing tells the MJCF of this {type(source).__name__}; give its file, its MjSpec, or an environment "
+            "whose fullpath is the file that it was loaded from"
+        )
+    model = correct(nominal, effects)
+    text, assets = write_mjcf(spec, model)
+    stored = {
+        "format": FORMAT,
+        "mujoco": mujoco.__version__,
+        "model": {"file": "model.xml", "sha256": hashlib.sha256(text.encode()).hexdigest()},
+        "effects": [_describe(effect) for effect in own(effects, nominal)],
+        "exact": _exact(mujoco.MjModel.from_xml_string(text, assets), model),
+    }
+    folder = Path(folder)
+    (folder / "assets" if assets else folder).mkdir(parents=True, exist_ok=True)
+    for name, content in assets.items():
+        _write(folder / name, content)
+    _write(folder / "model.xml", text.encode())
+    _write(folder / "effects.json", json.dumps(stored, indent=1).encode())
+
+
+def load_corrected(folder: str | os.PathLike[str]) -> Corrected:
+    """Load what :func:`save_corrected` saved: the same simulator bit for bit, given the same version of MuJoCo.
+
+    :raises FileNotFoundError: one of the files is missing
+    :raises ValueError: files that do not belong together, another format, or an effect that is not registered
+    """
+    folder = Path(folder)
+    path, xml = folder / "effects.json", folder / "model.xml"
+    for file in (path, xml):
+        if not file.is_file():
+            raise FileNotFoundError(f"{folder} holds no corrected simulator: {file.name} is missing; save it again")
+    try:
+        stored = json.loads(path.read_bytes())
+        version, digest = stored["format"], stored["model"]["sha256"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} does not describe a corrected simulator; save it again") from error
+    if version != FORMAT:
+        raise ValueError(f"{path} has format {version!r}, this version of sb3_rpto reads {FORMAT}; save it again")
+    if hashlib.sha256(xml.read_bytes()).hexdigest() != digest:
+        raise ValueError(
+            f"{xml} is not the file that effects.json was written for; save both again, or load an edited model.xml "
+            "by itself"
+        )
+    if stored["mujoco"] != mujoco.__version__:
+        warnings.warn(
+            f"{folder} was saved with MuJoCo {stored['mujoco']}; under {mujoco.__version__} it may differ by rounding",
+            stacklevel=2,
+        )
+    model = mujoco.MjModel.from_xml_path(str(xml))
+    for name, entry in stored["exact"].items():
+        set_number(model, name, entry["index"], entry["value"])
+    return Corrected(model, [_rebuild(entry, model) for entry in stored["effects"]])
+
+
+def _describe(effect: Effect) -> dict[str, Any]:
+    entry = effect.to_json()
+    entry["values"] = {name: float(value) for name, value in entry["values"].items()}
+    entry["unit"] = {p.name: p.unit for p in effect.parameters}
+    entry["equation"] = effect.equation
+    entry["carried_by"] = carried_by(effect)
+    if isinstance(effect, Declared):
+        entry["nominal"] = {effect.label: float(effect.nominal)}
+    return entry
+
+
+def _rebuild(entry: Mapping[str, Any], model: mujoco.MjModel) -> Effect:
+    if entry["kind"] == Declared.kind:
+        ((name, value),) = entry["values"].items()
+        return Declared(model, name, (-np.inf, np.inf)).with_values(np.array([value]))
+    if entry["kind"] not in LIBRARY:
+        raise ValueError(
+            f"no effect {entry['kind']!r} is registered ({near(entry['kind'], LIBRARY)}); import the module with "
+            "its class, decorated with @sb3_rpto.effects.register, before loading"
+        )
+    return from_json(entry)
+
+
+def _exact(compiled: mujoco.MjModel, model: mujoco.MjModel) -> dict[str, dict[str, list[Any]]]:
+    """The numbers of ``model`` that differ in ``compiled``, by flat index."""
+    if not same_layout(compiled, model):
+        raise ValueError("the MJCF that MuJoCo writes for this model compiles to another layout; name all its objects")
+    theirs, found = numbers(compiled), {}
+    for name, ours in numbers(model).items():
+        index = np.flatnonzero(ours.reshape(-1) != theirs[name].reshape(-1))
+        if len(index):
+            found[name] = {"index": index.tolist(), "value": ours.reshape(-1)[index].tolist()}
+    return found
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Replace a file in one go."""
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+        temporary = Path(file.name)
+        try:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        except BaseException:
+            temporary.unlink()
+            raise
+    temporary.chmod(0o644)
+    temporary.replace(path)

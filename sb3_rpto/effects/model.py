@@ -1,0 +1,109 @@
+"""MuJoCo models from whatever holds one."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+
+#: what :func:`load_model` takes
+ModelSource: TypeAlias = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | gym.Env
+
+
+def load_model(source: ModelSource) -> tuple[mujoco.MjSpec | None, mujoco.MjModel]:
+    """The compiled model that ``source`` holds, and the specification that it came from.
+
+    :param source: the path of an MJCF file, MJCF text, an MjSpec, an MjModel, or a gymnasium MuJoCo environment, whose
+        model may have been changed since it was loaded
+    :return: a specification (None where nothing tells it: for an MjModel, and for an environment whose file compiles to
+        a model of another layout) and a model; copies, the source is left alone
+    :raises TypeError: none of these
+    :raises FileNotFoundError: there is no such file
+    :raises ValueError: the MJCF does not compile; an environment without a MuJoCo model
+    """
+    if isinstance(source, mujoco.MjModel):
+        return None, copy.copy(source)
+    if isinstance(source, mujoco.MjSpec):
+        spec = source.copy()
+        return spec, spec.compile()
+    if isinstance(source, gym.Env):
+        return _from_env(source)
+    if isinstance(source, str) and source.lstrip().startswith("<"):
+        return _compiled(mujoco.MjSpec.from_string, source, "the MJCF text")
+    if isinstance(source, str | os.PathLike):
+        path = Path(source).expanduser()
+        if not path.is_file():
+            raise FileNotFoundError(f"there is no MJCF file {str(path)!r}; MJCF text would begin with '<'")
+        return _compiled(mujoco.MjSpec.from_file, str(path), str(path))
+    raise TypeError(
+        f"a model is the path or text of an MJCF file, an MjSpec, an MjModel or a gymnasium MuJoCo environment, "
+        f"not {type(source).__name__}"
+    )
+
+
+def _compiled(read: Any, source: str, name: str) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    try:
+        spec = read(source)
+        return spec, spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot compile {name}: {error}") from error
+
+
+def _from_env(env: gym.Env) -> tuple[mujoco.MjSpec | None, mujoco.MjModel]:
+    base: Any = env.unwrapped
+    model = getattr(base, "model", None)
+    if not isinstance(model, mujoco.MjModel):
+        raise ValueError(f"{type(base).__name__} has no MuJoCo model (env.unwrapped.model); give the MJCF itself")
+    path = getattr(base, "fullpath", None)
+    if path is None or not Path(path).is_file():
+        return None, copy.copy(model)
+    spec, compiled = load_model(path)
+    return (spec if same_layout(compiled, model) else None), copy.copy(model)
+
+
+def same_layout(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:
+    """Whether two models have the same objects by the same names, so that they may differ in numbers alone."""
+    if one.names != other.names:
+        return False
+    ours, theirs = numbers(one), numbers(other)
+    return all(ours[name].shape == theirs[name].shape for name in ours)
+
+
+def numbers(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Every number of a compiled model, live where it is an array: fields, options (``opt.``), statistics (``stat.``).
+
+    More than :data:`mujoco.batch.MODEL_FIELDS`: meshes, height fields and statistics act on the physics too.
+    """
+    found = {name: value for name, value in _public(model) if isinstance(value, np.ndarray)}
+    for part in ("opt", "stat"):
+        for name, value in _public(getattr(model, part)):
+            if isinstance(value, np.ndarray | float | int):
+                found[f"{part}.{name}"] = np.asarray(value)
+    # Where the names of asset files stand in a buffer of text.
+    return {name: value for name, value in found.items() if not name.endswith("pathadr")}
+
+
+def _public(owner: Any) -> Iterator[tuple[str, Any]]:
+    return ((name, getattr(owner, name)) for name in dir(owner) if not name.startswith("_"))
+
+
+def set_number(model: mujoco.MjModel, name: str, index: list[int], value: list[float]) -> None:
+    """Write entries of one of the :func:`numbers`, by flat index.
+
+    :raises ValueError: the model has no such field, or it is smaller
+    """
+    known = numbers(model)
+    if name not in known or max(index) >= known[name].size or len(index) != len(value):
+        raise ValueError(f"the model has no entry {max(index)} of {name!r}")
+    array = known[name]
+    part, dot, rest = name.rpartition(".")
+    if array.ndim:
+        array.reshape(-1)[index] = value
+    else:
+        setattr(getattr(model, part) if dot else model, rest, array.dtype.type(value[0]).item())

@@ -1,0 +1,182 @@
+"""Effects in an environment: what corrects a simulator, or shifts a target, while an agent learns in it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium.utils import EzPickle, RecordConstructorArgs
+
+from sb3_rpto.effects.declared import Declared
+from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.simulation import Active, prepare, push
+from sb3_rpto.effects.world import LiveWorld
+
+# Where gymnasium's MujocoEnv steps its physics, and what an environment without that method may offer instead.
+_SEAMS = ("_step_mujoco_simulation", "do_simulation")
+
+
+def own(effects: Sequence[Effect], model: mujoco.MjModel) -> list[Effect]:
+    """The same effects for ``model``, whose nominal values declared parameters start from.
+
+    :param effects: left as they are
+    :raises ValueError: the model lacks an object that an effect sits on
+    """
+    mine: list[Effect] = []
+    for effect in effects:
+        if isinstance(effect, Declared):
+            effect = Declared(model, effect.label, (-np.inf, np.inf)).with_values(effect.values)
+        else:
+            effect = copy.copy(effect)
+        effect.bind(model)
+        mine.append(effect)
+    return mine
+
+
+def active(effects: Sequence[Effect]) -> Active:
+    """Effects that do something, each with its values, (1, p), as :class:`~sb3_rpto.effects.Simulation` picks them."""
+    return [
+        (e, e.values[None])
+        for e in effects
+        if isinstance(e, Declared) or any(v != p.null for p, v in zip(e.parameters, e.values) if not p.shape)
+    ]
+
+
+class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
+    """A gymnasium MuJoCo environment with effects, exactly as :class:`~sb3_rpto.effects.Simulation` has them.
+
+    Numbers of the model are written once, into the environment's own model: afterwards that environment **is** the
+    corrected one. :func:`sb3_rpto.envs.corrected.apply_effects` corrects a copy instead. Forces and commands
+    act in every substep, sensors in every observation; rewards and terminations that a task computes from its state see
+    the true state. Without effects every step is the wrapped environment's, bit for bit.
+
+    :param env: one whose innermost environment has MuJoCo's ``model`` and ``data`` and steps them by ``do_simulation``
+    :param effects: those of the model's own numbers, forces, commands and sensors, with their values
+    :raises ValueError: no MuJoCo environment, or one that has effects already; an effect on an object not in the model
+    """
+
+    #: what changes after it is made, for :func:`sb3_rpto.envs.state.save_state`
+    state_attributes: ClassVar[tuple[str, ...]] = ("_memory",)
+
+    def __init__(self, env: gym.Env, effects: Sequence[Effect]) -> None:
+        RecordConstructorArgs.__init__(self, effects=effects)
+        gym.Wrapper.__init__(self, env)
+        base, seam = _steps(env)
+        self.effects = own(effects, base.model)
+        found = active(self.effects)
+        prepare(LiveWorld(base.model, base.data), found)
+        self._acting = [pair for pair in found if pair[0].overrides("act")]
+        self._commanding = sorted((p for p in found if p[0].overrides("command")), key=lambda pair: pair[0].order)
+        self._sensing = [pair for pair in found if pair[0].overrides("observe")]
+        self._memory: list[dict[str, Any]] = [{} for _ in self._commanding]
+        self._hooks: dict[str, bool] = {}  # whether each was called yet
+        if self._acting or self._commanding:
+            setattr(base, seam, self._simulate)
+            self._hooks[seam] = False
+        if self._sensing:
+            if not callable(getattr(base, "_get_obs", None)):
+                names = ", ".join(effect.label for effect, _ in self._sensing)
+                raise ValueError(f"{names}: {type(base).__name__} has no _get_obs(); read its sensors there")
+            base._get_obs = self._observe
+            self._hooks["_get_obs"] = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; commands from before it are forgotten."""
+        self._memory = [{} for _ in self._commanding]
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the wrapped environment.
+
+        :raises ValueError: the environment steps or reads its simulation by other ways than do_simulation and _get_obs
+        """
+        result = self.env.step(action)
+        if not all(self._hooks.values()):
+            unused = [name for name, called in self._hooks.items() if not called]
+            raise ValueError(
+                f"{type(self.unwrapped).__name__} does not use {' and '.join(unused)}, so its effects cannot act; "
+                "step the physics by self.do_simulation(ctrl, self.frame_skip) and read it in self._get_obs()"
+            )
+        return result
+
+    def _simulate(self, ctrl: np.ndarray, n_frames: int) -> None:
+        """In place of MujocoEnv's own: the same, with the effects in every substep."""
+        base: Any = self.unwrapped
+        model, data = base.model, base.data
+        self._hooks.update(dict.fromkeys(self._hooks.keys() & set(_SEAMS), True))
+        world = LiveWorld(model, data)
+        for effect, _ in self._acting:
+            if effect.place == "joint":
+                world.rough(effect.dof)
+        world.settle()
+        command, dt = np.array(ctrl, dtype=float), model.opt.timestep
+        for _ in range(n_frames):
+            sent = command.copy()
+            for (effect, x), memory in zip(self._commanding, self._memory):
+                sent[effect.index] = effect.command(np.array([sent[effect.index]]), x, memory, dt)[0]
+            data.ctrl[:] = sent
+            if self._acting:
+                push(world, self._acting)
+            mujoco.mj_step(model, data)
+        if self._acting:
+            # What a later set_state computes must not depend on the substep before it.
+            world.restore()
+            data.qfrc_applied[:] = 0
+        mujoco.mj_rnePostConstraint(model, data)
+
+    def _observe(self, *args: Any, **kwargs: Any) -> Any:
+        """In place of the task's own ``_get_obs``: the same, of what the sensors show."""
+        self._hooks["_get_obs"] = True
+        base: Any = self.unwrapped
+        data = base.data
+        qpos, qvel = data.qpos.copy(), data.qvel.copy()
+        for effect, x in self._sensing:
+            q, v = effect.observe(np.array([data.qpos[effect.adr]]), np.array([data.qvel[effect.dof]]), x)
+            data.qpos[effect.adr], data.qvel[effect.dof] = q[0], v[0]
+        try:
+            # A copy: observations may be views of the state.
+            return copy.deepcopy(type(base)._get_obs(base, *args, **kwargs))
+        finally:
+            data.qpos[:], data.qvel[:] = qpos, qvel
+
+    def __getstate__(self) -> dict[str, Any]:
+        """As gymnasium's own pickling of MuJoCo tasks: what makes a new one, without the state of the simulation."""
+        if not isinstance(self.unwrapped, EzPickle):
+            raise TypeError(
+                f"{type(self.unwrapped).__name__} is no EzPickle, so its pickle would hide what was written to its "
+                "model; copy it by sb3_rpto.envs.state.copy_env"
+            )
+        return {"env": self.env, "effects": self.effects}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        CorrectedEnv.__init__(self, **state)
+
+
+def is_corrected(env: gym.Env) -> bool:
+    """Whether any of its wrappers is a :class:`CorrectedEnv`."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, CorrectedEnv):
+            return True
+        env = env.env
+    return False
+
+
+def _steps(env: gym.Env) -> tuple[Any, str]:
+    """The innermost environment and the name of the method that steps its physics."""
+    base: Any = env.unwrapped
+    if is_corrected(env):
+        raise ValueError("env has effects already; give one CorrectedEnv all of them")
+    seam = next((name for name in _SEAMS if callable(getattr(base, name, None))), None)
+    mine = isinstance(getattr(base, "model", None), mujoco.MjModel) and isinstance(
+        getattr(base, "data", None), mujoco.MjData
+    )
+    if seam is None or not mine:
+        raise ValueError(
+            f"{type(base).__name__} is no gymnasium MuJoCo environment; derive it from "
+            "gymnasium.envs.mujoco.MujocoEnv, which has model, data and do_simulation"
+        )
+    return base, seam

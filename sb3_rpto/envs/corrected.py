@@ -1,0 +1,31 @@
+"""Corrected copies of environments."""
+
+from collections.abc import Sequence
+
+import gymnasium as gym
+
+from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.state import copy_env
+
+
+def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:
+    """A copy of ``env`` with effects, for RPTO, SAC or anything; ``env`` is left alone.
+
+    :param env: a gymnasium MuJoCo environment, with all its wrappers; the copy draws no pictures and writes no files
+        (for those ``CorrectedEnv(gym.make(..., render_mode=...), effects)``)
+    :param effects: with their values
+    :raises TypeError: a VecEnv
+    :raises ValueError: no gymnasium MuJoCo environment, one that has effects already, or one that cannot be copied
+    """
+    if not isinstance(env, gym.Env):
+        raise TypeError(
+            f"env must be a gymnasium environment, not {type(env).__name__}; correct each one before "
+            "stable_baselines3.common.env_util.make_vec_env stacks them"
+        )
+    twin = copy_env(env)
+    if twin is None:
+        raise ValueError(
+            f"{env} holds what cannot be copied; make a new one and wrap it: CorrectedEnv(gym.make(...), effects)"
+        )
+    return CorrectedEnv(twin, effects)

@@ -1,0 +1,329 @@
+"""Corrected simulators reload bit for bit, and models load from whatever holds one."""
+
+import json
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales, Simulation, declare, register
+from sb3_rpto.effects.carry import carried_by, correct, load_corrected, save_corrected
+from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
+from sb3_rpto.effects.model import load_model, numbers
+from sb3_rpto.effects.wrapper import CorrectedEnv
+
+POLE = "InvertedDoublePendulum-v5"
+ARM = """
+<mujoco model="arm">
+  <compiler inertiafromgeom="true" settotalmass="3.3"/>
+  <option timestep="0.002" integrator="implicitfast" density="1.2"/>
+  <default><geom density="700" friction="0.8"/></default>
+  <asset>%s</asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="2 2 .1" pos="0 0 -.4"/>
+    <body name="upper" pos="0 0 1" euler="10 20 30">
+      <joint name="shoulder" axis="0 1 0" damping="0.1234567890123" range="-150 150"/>
+      <geom name="upper" type="capsule" size=".04" fromto="0 0 0 .33333333333 0 0"/>
+      <body name="fore" pos=".33333333333 0 0">
+        <joint name="elbow" axis="0 1 0" armature="0.01"/>
+        <geom name="fore" type="capsule" size=".03" fromto="0 0 0 .28571428571 0 0"/>
+        %s
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="motor" joint="shoulder" gear="3" ctrlrange="-1 1"/>
+    <position name="servo" joint="elbow" kp="7" kv="0.5"/>
+  </actuator>
+</mujoco>
+"""
+PLAIN = ARM % ("", "")
+TETRAHEDRON = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+MESHED = (ARM % ('<mesh name="tip" file="tip.obj"/>', '<geom type="mesh" mesh="tip" pos=".3 0 0"/>')).replace(
+    "<compiler ", '<compiler meshdir="parts" '
+)
+# MuJoCo says so of an attribute that gymnasium's HalfCheetah has
+pytestmark = pytest.mark.filterwarnings("ignore:.*settotalmass")
+
+
+@register
+class Hold(Effect):
+    """What the library's own filters and delays look like here."""
+
+    kind, place, equation = "test_hold", "actuator", "u of the step before"
+    parameters = (Parameter("share", "", 0.1),)
+
+    def command(self, u, x, memory, dt):
+        last, memory["u"] = memory.get("u", u), u
+        return (1 - x[:, 0]) * u + x[:, 0] * last
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _unregister():
+    yield
+    LIBRARY.pop("test_hold")
+
+
+def effects(model):
+    values = {
+        "shoulder.damping": 1 / 3,
+        "elbow.armature": 0.0271828182845904,
+        "fore.mass": np.pi / 2,
+        "option.gravity": 9.7 + 1e-9,
+        "option.viscosity": 1e-4 / 3,
+        "motor.gear": 3.3,
+        "servo.strength": 1.07,
+        "floor.friction": 0.7,
+    }
+    declared = [Declared(model, name).with_values(np.array([value])) for name, value in values.items()]
+    return [
+        *declared,
+        CoulombFriction("elbow", level=0.1 / 3),
+        StribeckFriction("shoulder", extra=0.07, level=0.021, speed=0.35),
+        Hold("motor", share=0.6),
+    ]
+
+
+def rollout(simulation, seed=0, steps=200):
+    model, rng = simulation.model, np.random.default_rng(seed)
+    commands = rng.normal(size=(2, steps, model.nu)).repeat(1, axis=1)
+    qpos, qvel = rng.normal(size=(2, model.nq)), rng.normal(size=(2, model.nv))
+    return simulation.rollout(np.tile(simulation.values(), (2, 1)), qpos, qvel, Drive(commands))
+
+
+def assert_equal_models(one, other):
+    theirs = numbers(other)
+    for name, value in numbers(one).items():
+        np.testing.assert_array_equal(value, theirs[name], err_msg=name)
+
+
+def assert_equal_rollouts(one, other):
+    for a, b in zip(rollout(one), rollout(other), strict=True):
+        assert np.isfinite(a).all()
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_saved_simulator_reloads_bit_for_bit(tmp_path):
+    nominal = load_model(PLAIN)[1]
+    chosen = effects(nominal)
+    save_corrected(tmp_path, PLAIN, chosen)
+    loaded = load_corrected(tmp_path)
+    assert_equal_models(loaded.model, correct(nominal, chosen))
+    # ... and to what acts before anything is saved, declared parameters and all
+    assert_equal_rollouts(loaded.simulation(1), Simulation(nominal, chosen, 1))
+    for one, other in zip(loaded.effects, chosen, strict=True):
+        assert (one.kind, one.label) == (other.kind, other.label)
+        np.testing.assert_array_equal(one.values, other.values)
+
+
+@pytest.mark.parametrize("kind", sorted(LIBRARY.keys() - {"test_hold"}))
+def test_every_effect_of_the_library_reloads(tmp_path, kind):
+    nominal, cls = load_model(PLAIN)[1], LIBRARY[kind]
+    values = {p.name: np.clip(p.null + p.size_for(Scales()) / 3, p.lower, p.upper) for p in cls.parameters}
+    chosen = [cls(cls.places(nominal)[-1], **values)]
+    save_corrected(tmp_path, PLAIN, chosen)
+    loaded = load_corrected(tmp_path)
+    np.testing.assert_array_equal(loaded.effects[0].values, chosen[0].values)
+    assert_equal_models(loaded.model, correct(nominal, chosen))
+    assert_equal_rollouts(loaded.simulation(1), Simulation(nominal, chosen, 1))
+
+
+def test_every_declared_parameter_reloads(tmp_path):
+    nominal = load_model(PLAIN)[1]
+    chosen = [d.with_values(d.values * (1 + 1 / 7) + 1e-3 / 3) for d in declare(nominal, ["*"])]
+    save_corrected(tmp_path, PLAIN, chosen)
+    loaded = load_corrected(tmp_path)
+    assert_equal_models(loaded.model, correct(nominal, chosen))
+    assert_equal_rollouts(loaded.simulation(1), Simulation(nominal, chosen, 1))
+
+
+def test_saving_what_was_loaded_gives_the_same_files(tmp_path):
+    save_corrected(tmp_path / "one", PLAIN, effects(load_model(PLAIN)[1]))
+    save_corrected(tmp_path / "two", PLAIN, load_corrected(tmp_path / "one").effects)
+    for name in ("model.xml", "effects.json"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+    assert_equal_models(load_corrected(tmp_path / "one").model, load_corrected(tmp_path / "two").model)
+
+
+def test_the_mjcf_alone_is_the_corrected_model_up_to_its_digits(tmp_path):
+    nominal = load_model(PLAIN)[1]
+    chosen = effects(nominal)
+    save_corrected(tmp_path, PLAIN, chosen)
+    plain, exact = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml")), numbers(correct(nominal, chosen))
+    for name, value in numbers(plain).items():
+        if not name.startswith("stat."):
+            np.testing.assert_allclose(value, exact[name], rtol=2e-5, atol=2e-5, err_msg=name)
+    assert plain.dof_frictionloss[1] == pytest.approx(0.1 / 3, rel=1e-5)
+
+
+def test_the_json_says_what_carries_an_effect(tmp_path):
+    save_corrected(tmp_path, PLAIN, effects(load_model(PLAIN)[1]))
+    stored = json.loads((tmp_path / "effects.json").read_text())
+    entries = {entry["kind"]: entry for entry in stored["effects"]}
+    assert {kind: entry["carried_by"] for kind, entry in entries.items()} == {
+        "declared": "mjcf",
+        "coulomb_friction": "mjcf",
+        "stribeck_friction": "wrapper",
+        "test_hold": "wrapper",
+    }
+    assert entries["stribeck_friction"]["unit"] == {"extra": "N·m", "level": "N·m", "speed": "rad/s"}
+    assert entries["stribeck_friction"]["equation"] == StribeckFriction.equation
+    assert stored["effects"][0] == {
+        "kind": "declared",
+        "on": "",
+        "values": {"shoulder.damping": 1 / 3},
+        "unit": {"shoulder.damping": "N·m·s/rad"},
+        "equation": Declared.equation,
+        "carried_by": "mjcf",
+        "nominal": {"shoulder.damping": 0.1234567890123},
+    }
+    assert carried_by(Hold("motor")) == "wrapper"
+
+
+@pytest.mark.parametrize("name", ["HalfCheetah-v5", "Hopper-v5", "Humanoid-v5"])
+def test_an_environment_reloads_with_what_was_changed_in_it(tmp_path, name):
+    env = gym.make(name)
+    model = env.unwrapped.model
+    model.dof_damping[-1] += 1e-7 / 3  # a shift of the task itself, too small for the MJCF's digits
+    model.qpos_spring[-1] = 0.1
+    model.opt.wind[:] = (1 / 3, 0, 0)
+    before = {field: value.copy() for field, value in numbers(model).items()}
+    joint = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt - 1)
+    body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, 2)
+    chosen = [
+        Declared(model, f"{body}.mass").with_values(np.array([3.3])),
+        CoulombFriction(joint, level=0.7),
+        StribeckFriction(joint, extra=1.0, level=0.3),
+    ]
+    save_corrected(tmp_path, env, chosen)
+    np.testing.assert_equal(numbers(model), before)
+    loaded = load_corrected(tmp_path)
+    assert_equal_models(loaded.model, correct(model, chosen))
+    assert loaded.model.dof_damping[-1] == model.dof_damping[-1]
+    applied = loaded.apply(env)
+    assert isinstance(applied, CorrectedEnv)
+    for field in ("body_mass", "body_inertia", "dof_invweight0", "dof_frictionloss", "opt.wind"):
+        np.testing.assert_array_equal(numbers(applied.unwrapped.model)[field], numbers(loaded.model)[field])
+    with pytest.raises(ValueError, match="has effects already"):
+        save_corrected(tmp_path, applied, [])
+
+
+def test_the_applied_one_steps_as_the_saved_one(tmp_path):
+    env, twin = gym.make(POLE), gym.make(POLE)
+    chosen = [
+        Declared(env.unwrapped.model, "pole.mass").with_values(np.array([5.1])),
+        CoulombFriction("hinge", level=0.02),
+        StribeckFriction("slider", extra=0.3, level=0.2, speed=0.2),
+        Hold("slide", share=0.4),
+    ]
+    save_corrected(tmp_path, env, chosen)
+    one, two = CorrectedEnv(env, chosen), load_corrected(tmp_path).apply(twin)
+    np.testing.assert_array_equal(one.reset(seed=0)[0], two.reset(seed=0)[0])
+    for action in np.random.default_rng(0).uniform(-1, 1, size=(50, 1)):
+        np.testing.assert_equal(one.step(action), two.step(action))
+
+
+def test_meshes_travel_with_the_model(tmp_path):
+    (tmp_path / "here" / "parts").mkdir(parents=True)
+    (tmp_path / "here" / "arm.xml").write_text(MESHED)
+    (tmp_path / "here" / "parts" / "tip.obj").write_text(TETRAHEDRON)
+    nominal = load_model(tmp_path / "here" / "arm.xml")[1]
+    chosen = effects(nominal)
+    save_corrected(tmp_path / "there", tmp_path / "here" / "arm.xml", chosen)
+    spec = mujoco.MjSpec.from_string(MESHED, assets={"parts/tip.obj": TETRAHEDRON.encode()})
+    save_corrected(tmp_path / "from_memory", spec, chosen)
+    (tmp_path / "here" / "parts" / "tip.obj").unlink()
+    (tmp_path / "there").rename(tmp_path / "moved")
+    for folder in ("moved", "from_memory"):
+        assert_equal_models(load_corrected(tmp_path / folder).model, correct(nominal, chosen))
+    with pytest.raises((ValueError, FileNotFoundError), match=r"tip\.obj"):
+        save_corrected(tmp_path / "again", tmp_path / "here" / "arm.xml", chosen)
+    assert not (tmp_path / "again").exists()
+
+
+def test_torn_folders_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"effects\.json is missing"):
+        load_corrected(tmp_path)
+    save_corrected(tmp_path, PLAIN, [CoulombFriction("elbow", level=0.1), Hold("motor", share=0.5)])
+    xml, path = tmp_path / "model.xml", tmp_path / "effects.json"
+    text, stored = xml.read_text(), json.loads(path.read_text())
+    xml.write_text(text.replace("shoulder", "shudder"))
+    with pytest.raises(ValueError, match="is not the file that"):
+        load_corrected(tmp_path)
+    xml.unlink()
+    with pytest.raises(FileNotFoundError, match=r"model\.xml is missing"):
+        load_corrected(tmp_path)
+    xml.write_text(text)
+    path.write_text(json.dumps(stored | {"format": 99}))
+    with pytest.raises(ValueError, match="format 99"):
+        load_corrected(tmp_path)
+    path.write_text(json.dumps(stored)[:100])
+    with pytest.raises(ValueError, match="does not describe a corrected simulator"):
+        load_corrected(tmp_path)
+    path.write_text(json.dumps(stored | {"exact": {"dof_damping": {"index": [7], "value": [1.0]}}}))
+    with pytest.raises(ValueError, match="no entry 7 of 'dof_damping'"):
+        load_corrected(tmp_path)
+    path.write_text(json.dumps(stored | {"mujoco": "3.0.0"}))
+    with pytest.warns(UserWarning, match=r"saved with MuJoCo 3\.0\.0"):
+        load_corrected(tmp_path)
+    path.write_text(json.dumps(stored).replace("test_hold", "test_held"))
+    with pytest.raises(ValueError, match=r"'test_held' is registered.*'test_hold'.*@sb3_rpto\.effects\.register"):
+        load_corrected(tmp_path)
+
+
+def test_a_failed_save_leaves_the_last_one(tmp_path):
+    save_corrected(tmp_path, PLAIN, [CoulombFriction("elbow", level=0.1)])
+    with pytest.raises(ValueError, match="no joint 'knee'"):
+        save_corrected(tmp_path, PLAIN, [CoulombFriction("knee", level=0.2)])
+    assert load_corrected(tmp_path).effects[0].values == 0.1
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["effects.json", "model.xml"]
+
+
+def test_what_mjcf_cannot_say_is_kept_by_the_json(tmp_path, monkeypatch):
+    env = gym.make(POLE)
+    env.unwrapped.model.body_subtreemass[0] = 123.0  # derived, so no MJCF attribute sets it
+    env.unwrapped.model.dof_damping[0] = 0.75
+    save_corrected(tmp_path, env, [])
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml")).dof_damping[0] == 0.75
+    assert load_corrected(tmp_path).model.body_subtreemass[0] == 123.0
+
+
+# --- models -----------------------------------------------------------------------------------------------------
+
+
+def test_models_load_from_every_source(tmp_path):
+    (tmp_path / "arm.xml").write_text(PLAIN)
+    spec = mujoco.MjSpec.from_string(PLAIN)
+    compiled = spec.compile()
+    for source in (PLAIN, "\n " + PLAIN, tmp_path / "arm.xml", str(tmp_path / "arm.xml"), spec):
+        found, model = load_model(source)
+        assert found is not None
+        assert found is not source
+        assert_equal_models(model, compiled)
+    found, model = load_model(compiled)
+    assert found is None
+    assert model is not compiled
+    assert_equal_models(model, compiled)
+    env = gym.make("Hopper-v5")
+    env.unwrapped.model.dof_damping[3] = 0.125
+    found, model = load_model(env)
+    assert found is not None
+    assert model.dof_damping[3] == 0.125
+    assert model is not env.unwrapped.model
+
+
+def test_bad_sources_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no MJCF file"):
+        load_model(tmp_path / "missing.xml")
+    with pytest.raises(ValueError, match="cannot compile the MJCF text"):
+        load_model("<mujoco><oops/></mujoco>")
+    (tmp_path / "bad.xml").write_text("<mujoco>")
+    with pytest.raises(ValueError, match=r"cannot compile .*bad\.xml"):
+        load_model(tmp_path / "bad.xml")
+    with pytest.raises(TypeError, match="not int"):
+        load_model(3)
+    with pytest.raises(ValueError, match="PendulumEnv has no MuJoCo model"):
+        load_model(gym.make("Pendulum-v1"))
+    with pytest.raises(ValueError, match="nothing tells the MJCF of this MjModel"):
+        save_corrected(tmp_path, mujoco.MjModel.from_xml_string(PLAIN), [])

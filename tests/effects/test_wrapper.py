@@ -1,0 +1,251 @@
+"""Environments with effects step exactly as the batch does, and without effects exactly as before."""
+
+import copy
+import pickle
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3 import SAC
+
+from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales, Simulation
+from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
+from sb3_rpto.effects.wrapper import CorrectedEnv, is_corrected
+
+POLE = "InvertedDoublePendulum-v5"
+
+
+class Lag(Effect):
+    """A command filter with memory."""
+
+    kind, place, equation = "test_lag", "actuator", "y' = (u - y)/T"
+    parameters = (Parameter("time", "s", 0.1, lower=0.0),)
+
+    def command(self, u, x, memory, dt):
+        memory["y"] = memory.get("y", np.zeros_like(u)) * np.exp(-dt / x[:, 0]) + u * (1 - np.exp(-dt / x[:, 0]))
+        return memory["y"]
+
+
+class Double(Effect):
+    """A gain on the command; nearer the actuator than the lag, though it may be listed before."""
+
+    kind, place, equation, order = "test_gain", "actuator", "(1 + g) u - 0.1", 1
+    parameters = (Parameter("g", "", 0.1),)
+
+    def command(self, u, x, memory, dt):
+        return (1 + x[:, 0]) * u - 0.1
+
+
+class Clock(Effect):
+    """A force that knows the time, so that one that acts once a control step shows."""
+
+    kind, place, equation = "test_clock", "joint", "a sin(500 t)"
+    parameters = (Parameter("a", "N", 0.1),)
+
+    def act(self, world, x):
+        world.force[:, self.dof] += x[:, 0] * np.sin(500 * world.time)
+
+
+class Bias(Effect):
+    kind, place, equation = "test_bias", "sensor", "q + b"
+    parameters = (Parameter("b", "rad", 0.1),)
+
+    def observe(self, q, v, x):
+        return q + x[:, 0], 2 * v
+
+
+def effects(model):
+    return [
+        Declared(model, "hinge.damping").with_values(np.array([0.3])),
+        Declared(model, "cart.mass").with_values(np.array([7.0])),
+        Declared(model, "option.density").with_values(np.array([500.0])),
+        CoulombFriction("slider", level=0.4),
+        StribeckFriction("hinge2", extra=0.2, level=0.05, speed=0.4),
+        Clock("hinge", a=3.0),
+        Double("slide", g=0.4),
+        Lag("slide", time=0.02),
+    ]
+
+
+def actions_for(env, steps, seed=1):
+    space = env.action_space
+    return np.random.default_rng(seed).uniform(space.low, space.high, size=(steps, *space.shape)).astype(np.float32)
+
+
+def run(env, actions, seed=0):
+    first, _ = env.reset(seed=seed)
+    return [(first,), *(env.step(action) for action in actions)]
+
+
+def assert_same(one, other):
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_equal(a, b)
+
+
+@pytest.mark.parametrize("name", [POLE, "HalfCheetah-v5", "Hopper-v5"])
+def test_no_effects_change_nothing(name):
+    bare, wrapped = gym.make(name), CorrectedEnv(gym.make(name), [])
+    actions = actions_for(bare, 40)
+    assert_same(run(wrapped, actions), run(bare, actions))
+
+
+@pytest.mark.parametrize("name", ["HalfCheetah-v5", "Hopper-v5"])
+def test_the_substeps_are_gymnasiums(name):
+    """The loop that effects run in is MujocoEnv's own when what they add is nothing."""
+
+    class Nothing(Clock):
+        kind, place = "test_nothing", "world"  # on a joint it would make the dry friction there stiffer
+
+        def act(self, world, x):
+            world.force[:] += 0.0
+
+    bare, wrapped = gym.make(name), CorrectedEnv(gym.make(name), [Nothing(a=1.0)])
+    actions = actions_for(bare, 40)
+    assert_same(run(wrapped, actions), run(bare, actions))
+
+
+def test_effects_at_their_null_change_nothing():
+    bare = gym.make(POLE)
+    actions = actions_for(bare, 30)
+    names = ("slider", "hinge2", "hinge", "slide", "slide", "hinge")
+    kinds = (CoulombFriction, StribeckFriction, Clock, Double, Lag, Bias)
+    wrapped = CorrectedEnv(gym.make(POLE), [kind(on) for kind, on in zip(kinds, names)])
+    assert_same(run(wrapped, actions), run(bare, actions))
+
+
+def from_library(kind, model):
+    cls = LIBRARY[kind]
+    values = {p.name: np.clip(p.null + p.size_for(Scales()) / 3, p.lower, p.upper) for p in cls.parameters}
+    return [cls(cls.places(model)[-1], **values)]
+
+
+@pytest.mark.parametrize("kind", ["", *sorted(LIBRARY)])
+def test_it_steps_as_the_batch_does(kind):
+    env = gym.make(POLE)
+    base = env.unwrapped
+    base.model.opt.density, base.model.geom_contype[-1] = 1.2, 1  # for the wind and the friction of contacts
+    mujoco.mj_setConst(base.model, mujoco.MjData(base.model))
+    nominal = copy.copy(base.model)
+    chosen = from_library(kind, nominal) if kind else effects(nominal)
+    wrapped = CorrectedEnv(env, chosen)
+    wrapped.reset(seed=0)
+    qpos, qvel = np.array([0.1, 0.3, -0.4]), np.array([0.5, -1.0, 2.0])
+    mujoco.mj_resetData(base.model, base.data)
+    base.data.qpos[:], base.data.qvel[:] = qpos, qvel
+    actions = actions_for(env, 60)
+    states = [np.concatenate([qpos, qvel])]
+    for action in actions:
+        base.do_simulation(action, base.frame_skip)
+        states.append(base.state_vector())
+    simulation = Simulation(nominal, chosen, nthread=1)
+    drive = Drive(np.repeat(actions, base.frame_skip, axis=0)[None].astype(float))
+    q, v = simulation.rollout(simulation.values()[None], qpos[None], qvel[None], drive)
+    np.testing.assert_array_equal(np.array(states), np.hstack([q[0], v[0]])[:: base.frame_skip])
+
+
+def test_each_effect_shows():
+    bare = gym.make(POLE)
+    actions = actions_for(bare, 20)
+    reference = run(bare, actions)
+    for effect in [*effects(bare.unwrapped.model), Bias("hinge", b=0.2)]:
+        episode = run(CorrectedEnv(gym.make(POLE), [effect]), actions)
+        assert not np.allclose(episode[-1][0], reference[-1][0], rtol=1e-9), effect
+
+
+def test_the_state_stays_where_it_was():
+    env = gym.make(POLE)
+    env.reset(seed=3)
+    before = env.unwrapped.state_vector()
+    CorrectedEnv(env, effects(env.unwrapped.model))
+    np.testing.assert_array_equal(env.unwrapped.state_vector(), before)
+
+
+def test_a_reset_forgets_everything():
+    env = gym.make(POLE)
+    wrapped = CorrectedEnv(env, effects(env.unwrapped.model))
+    actions = actions_for(env, 25)
+    first = run(wrapped, actions)
+    run(wrapped, actions_for(env, 7, seed=2), seed=5)
+    assert_same(run(wrapped, actions), first)
+
+
+def test_the_effects_given_are_left_alone():
+    given = CoulombFriction("slider", level=0.4)
+    wrapped = CorrectedEnv(gym.make(POLE), [given])
+    assert not hasattr(given, "dof")
+    assert wrapped.effects[0].dof == 0
+
+
+def test_a_declared_value_is_the_environments_whatever_model_it_was_declared_for():
+    other, env = gym.make(POLE).unwrapped.model, gym.make(POLE)
+    other.body_mass[1] = 3.0
+    CorrectedEnv(env, [Declared(other, "cart.mass").with_values(np.array([7.0]))])
+    assert env.unwrapped.model.body_mass[1] == pytest.approx(7.0, rel=1e-15)
+
+
+def test_sensors_shift_the_observation_and_not_the_state():
+    bare = gym.make("HalfCheetah-v5")
+    wrapped = CorrectedEnv(gym.make("HalfCheetah-v5"), [Bias("bthigh", b=0.25)])
+    actions = actions_for(bare, 10)
+    for (true, *rest), (seen, *others) in zip(run(bare, actions), run(wrapped, actions), strict=True):
+        shift = seen - true
+        np.testing.assert_allclose(shift[2], 0.25, rtol=1e-12)  # the second joint behind the root's three, x left out
+        np.testing.assert_array_equal(seen[11], 2 * true[11])
+        shift[[2, 11]] = 0
+        np.testing.assert_array_equal(shift, 0)
+        assert rest == others
+    np.testing.assert_array_equal(bare.unwrapped.state_vector(), wrapped.unwrapped.state_vector())
+
+
+def test_observations_that_are_views_of_the_state_keep_what_the_sensor_shows():
+    env = gym.make(POLE).unwrapped
+    type_ = type("Views", (type(env),), {"_get_obs": lambda self: self.data.qpos})
+    wrapped = CorrectedEnv(type_(), [Bias("hinge", b=0.25)])
+    obs, _ = wrapped.reset(seed=0)
+    assert obs[1] == wrapped.unwrapped.data.qpos[1] + 0.25
+
+
+def test_other_environments_are_refused():
+    with pytest.raises(ValueError, match="PendulumEnv is no gymnasium MuJoCo environment"):
+        CorrectedEnv(gym.make("Pendulum-v1"), [])
+    with pytest.raises(ValueError, match="no joint 'elbow'"):
+        CorrectedEnv(gym.make(POLE), [CoulombFriction("elbow", level=1.0)])
+    wrapped = CorrectedEnv(gym.make(POLE), [])
+    assert is_corrected(wrapped)
+    with pytest.raises(ValueError, match="has effects already"):
+        CorrectedEnv(wrapped, [])
+
+
+def test_an_environment_that_goes_round_the_seam_is_found_out():
+    class Around(type(gym.make(POLE).unwrapped)):
+        def do_simulation(self, ctrl, n_frames):
+            MujocoEnv._step_mujoco_simulation(self, ctrl, n_frames)
+
+    wrapped = CorrectedEnv(Around(), [Clock("hinge", a=1.0)])
+    wrapped.reset(seed=0)
+    with pytest.raises(ValueError, match="do_simulation"):
+        wrapped.step(np.zeros(1))
+
+
+def test_pickle_and_deepcopy_make_a_fresh_one_with_the_same_effects():
+    env = gym.make(POLE)
+    wrapped = CorrectedEnv(env, effects(env.unwrapped.model))
+    actions = actions_for(env, 20)
+    assert_same(run(copy.deepcopy(wrapped), actions), run(wrapped, actions))
+    friction = CorrectedEnv(gym.make(POLE), [CoulombFriction("slider", level=0.4)])
+    assert_same(run(pickle.loads(pickle.dumps(friction)), actions), run(friction, actions))
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN:UserWarning")
+def test_it_is_a_gymnasium_environment_and_trains():
+    env = gym.make(POLE)
+    wrapped = CorrectedEnv(env, [*effects(env.unwrapped.model), Bias("hinge", b=0.1)])
+    check_env(wrapped, skip_render_check=True)
+    assert wrapped.spec.additional_wrappers[-1].name == "CorrectedEnv"
+    assert len(wrapped.spec.additional_wrappers[-1].kwargs["effects"]) == 9
+    agent = SAC("MlpPolicy", wrapped, learning_starts=10, batch_size=16, policy_kwargs={"net_arch": [16]}, seed=0)
+    agent.learn(50)
+    assert agent.num_timesteps == 50

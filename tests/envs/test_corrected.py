@@ -1,0 +1,151 @@
+"""Corrected copies: the source stays as it is, and branches of the copy replay exactly."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_rpto.effects import Declared, Effect, Parameter
+from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
+from sb3_rpto.effects.model import numbers
+from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.envs.state import copy_env, restore_state, save_state
+
+POLE = "InvertedDoublePendulum-v5"
+
+
+class Lag(Effect):
+    kind, place, equation = "test_lag", "actuator", "y' = (u - y)/T"
+    parameters = (Parameter("time", "s", 0.1, lower=0.0),)
+
+    def command(self, u, x, memory, dt):
+        keep = np.exp(-dt / x[:, 0])
+        memory["y"] = memory.get("y", np.zeros_like(u)) * keep + u * (1 - keep)
+        return memory["y"]
+
+
+class Bias(Effect):
+    kind, place, equation = "test_bias", "sensor", "q + b"
+    parameters = (Parameter("b", "rad", 0.1),)
+
+    def observe(self, q, v, x):
+        return q + x[:, 0], v
+
+
+def effects(model):
+    return [
+        Declared(model, "hinge.damping").with_values(np.array([0.3])),
+        Declared(model, "cart.mass").with_values(np.array([7.0])),
+        CoulombFriction("slider", level=0.4),
+        StribeckFriction("hinge2", extra=0.2, level=0.05, speed=0.4),
+        Lag("slide", time=0.2),
+        Bias("hinge2", b=0.02),
+    ]
+
+
+def actions_for(steps, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, size=(steps, 1)).astype(np.float32)
+
+
+def run(env, actions, seed=None):
+    first = [env.reset(seed=seed)[0]] if seed is not None else []
+    return [*first, *(env.step(action) for action in actions)]
+
+
+def assert_same(one, other):
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_equal(a, b)
+
+
+def fields(env):
+    return {name: value.copy() for name, value in numbers(env.unwrapped.model).items()}
+
+
+def test_the_source_is_not_changed():
+    source, reference = gym.make(POLE), gym.make(POLE)
+    run(source, actions_for(5), seed=0)
+    before, state, names = fields(source), source.unwrapped.state_vector(), set(vars(source.unwrapped))
+    corrected = apply_effects(source, effects(source.unwrapped.model))
+    run(corrected, actions_for(20), seed=1)
+    np.testing.assert_equal(fields(source), before)
+    np.testing.assert_array_equal(source.unwrapped.state_vector(), state)
+    assert set(vars(source.unwrapped)) == names
+    assert fields(corrected)["body_mass"][1] == pytest.approx(7.0)
+    assert_same(run(source, actions_for(20), seed=2), run(reference, actions_for(20), seed=2))
+
+
+def test_it_is_the_wrapped_environment():
+    source = gym.make(POLE)
+    wrapped = CorrectedEnv(gym.make(POLE), effects(source.unwrapped.model))
+    corrected = apply_effects(source, effects(source.unwrapped.model))
+    assert_same(run(corrected, actions_for(30), seed=3), run(wrapped, actions_for(30), seed=3))
+
+
+def test_shifts_of_the_source_are_kept():
+    source = gym.make(POLE)
+    source.unwrapped.model.dof_damping[0] = 1.25
+    assert fields(apply_effects(source, []))["dof_damping"][0] == 1.25
+
+
+def test_copies_branch_exactly_and_alone():
+    corrected = apply_effects(gym.make(POLE), effects(gym.make(POLE).unwrapped.model))
+    run(corrected, actions_for(7), seed=0)
+    twin, third = copy_env(corrected), copy_env(DummyVecEnv([lambda: corrected]))
+    assert isinstance(twin, CorrectedEnv)
+    ahead = run(twin, actions_for(20, seed=1))
+    assert_same(run(third, actions_for(20, seed=1)), ahead)
+    assert_same(run(corrected, actions_for(20, seed=1)), ahead)
+    assert_same(run(twin, actions_for(20), seed=9), run(corrected, actions_for(20), seed=9))
+
+
+def build():
+    env = make_vec_env(
+        lambda: apply_effects(gym.make(POLE, max_episode_steps=15), effects(gym.make(POLE).unwrapped.model)), 2, seed=4
+    )
+    env.reset()
+    return env
+
+
+def roll(env, actions):
+    return [env.step(np.stack([action, -action])) for action in actions]
+
+
+def test_a_saved_state_replays_exactly():
+    env, other = build(), build()
+    roll(env, actions_for(8))
+    state = save_state(env)
+    assert state is not None
+    ahead = roll(env, actions_for(30, seed=2))  # over the ends of episodes
+    assert any(dones.any() for _, _, dones, _ in ahead)
+    roll(other, actions_for(3, seed=5))
+    for twin in (env, other):
+        restore_state(twin, state)
+        for (obs, rewards, dones, _), (obs_, rewards_, dones_, _) in zip(
+            roll(twin, actions_for(30, seed=2)), ahead, strict=True
+        ):
+            np.testing.assert_array_equal(obs, obs_)
+            np.testing.assert_array_equal(rewards, rewards_)
+            np.testing.assert_array_equal(dones, dones_)
+
+
+def test_the_memory_of_commands_is_part_of_the_state():
+    env = build()
+    state = save_state(env)
+    env.envs[0].get_wrapper_attr("_memory")[0]["y"] = np.array([0.7])
+    restore_state(env, state)
+    assert env.envs[0].get_wrapper_attr("_memory") == [{}]
+
+
+def test_bad_environments_are_named():
+    with pytest.raises(TypeError, match="make_vec_env"):
+        apply_effects(make_vec_env(POLE), [])
+    with pytest.raises(ValueError, match="no gymnasium MuJoCo environment"):
+        apply_effects(gym.make("Pendulum-v1"), [])
+    with pytest.raises(ValueError, match="has effects already"):
+        apply_effects(apply_effects(gym.make(POLE), []), [])
+    stuck = gym.make(POLE)
+    stuck.unwrapped.lock = (n for n in ())  # generators cannot be copied
+    with pytest.raises(ValueError, match="cannot be copied"):
+        apply_effects(stuck, [])
