@@ -87,7 +87,7 @@ def effects(model):
 
 def rollout(simulation, seed=0, steps=200):
     model, rng = simulation.model, np.random.default_rng(seed)
-    commands = rng.normal(size=(2, steps, model.nu)).repeat(1, axis=1)
+    commands = rng.normal(size=(2, steps, model.nu))
     qpos, qvel = rng.normal(size=(2, model.nq)), rng.normal(size=(2, model.nv))
     return simulation.rollout(np.tile(simulation.values(), (2, 1)), qpos, qvel, Drive(commands))
 
@@ -280,7 +280,7 @@ def test_a_failed_save_leaves_the_last_one(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["effects.json", "model.xml"]
 
 
-def test_what_mjcf_cannot_say_is_kept_by_the_json(tmp_path, monkeypatch):
+def test_what_mjcf_cannot_say_is_kept_by_the_json(tmp_path):
     env = gym.make(POLE)
     env.unwrapped.model.body_subtreemass[0] = 123.0  # derived, so no MJCF attribute sets it
     env.unwrapped.model.dof_damping[0] = 0.75
