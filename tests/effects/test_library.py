@@ -1,0 +1,425 @@
+"""Every effect of the library: it vanishes at its null, follows its equation, and is recovered where it was planted."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from sb3_rpto.effects import LIBRARY, Drive, Effect, Scales, Simulation, from_json
+
+ARM = mujoco.MjModel.from_xml_string("""
+<mujoco>
+  <option timestep="0.004" density="50" viscosity="0.02"/>
+  <default><geom contype="0" conaffinity="0" density="1500"/></default>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="shoulder" axis="0 1 0" damping="0.05"/>
+      <geom type="capsule" fromto="0 0 0 0.05 0 -0.4" size="0.03"/>
+      <body name="lower" pos="0.05 0 -0.4">
+        <joint name="elbow" axis="1 0.5 0" damping="0.02"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="shoulder_motor" joint="shoulder" gear="12"/>
+    <motor name="elbow_motor" joint="elbow" gear="4"/>
+  </actuator>
+</mujoco>""")
+
+SLED = mujoco.MjModel.from_xml_string("""
+<mujoco>
+  <option timestep="0.004" cone="elliptic"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="9 9 1" friction="0.1"/>
+    <body name="sled" pos="0 0 0.0499">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <geom name="runner" type="box" size="0.2 0.1 0.05" friction="0.3" density="500"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="engine" joint="x" gear="60"/></actuator>
+</mujoco>""")
+
+#: One hinge of known inertia whose damping is integrated explicitly, so that a step shows the torque.
+HINGE = mujoco.MjModel.from_xml_string("""
+<mujoco>
+  <option timestep="0.001"><flag eulerdamp="disable"/></option>
+  <worldbody>
+    <body name="arm">
+      <joint name="hinge" axis="0 1 0"/>
+      <inertial pos="0 0 -0.5" mass="1.2" diaginertia="0.02 0.02 0.01"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge" gear="2" ctrlrange="-1 1"/></actuator>
+</mujoco>""")
+INERTIA = 1.2 * 0.5**2 + 0.02
+
+Torque = Callable[..., np.ndarray]  # of q, v, motor torque and the parameters
+
+
+class Row(NamedTuple):
+    """How an effect is planted, and where the search for it starts."""
+
+    on: str
+    planted: dict[str, float]
+    start: dict[str, float]
+    torque: Torque | None = None  # what it adds to HINGE; None: another test below has its equation
+    model: mujoco.MjModel = ARM
+
+
+def dry(level: Callable[..., np.ndarray]) -> Torque:
+    return lambda q, v, m, **x: -level(q, v, m, **x) * np.sign(v)
+
+
+def motor_limit(q: np.ndarray, v: np.ndarray, m: np.ndarray, inverse_stall: float, inverse_speed: float) -> np.ndarray:
+    stall = 1 / inverse_stall
+    upper = np.clip(stall * (1 - np.maximum(v, 0) * inverse_speed), 0, None)
+    lower = -np.clip(stall * (1 + np.minimum(v, 0) * inverse_speed), 0, None)
+    return np.clip(m, lower, upper) - m
+
+
+ROWS = {
+    "coulomb_friction": Row("shoulder", {"level": 0.6}, {"level": 0.1}, dry(lambda q, v, m, level: level)),
+    "stribeck_friction": Row(
+        "elbow",
+        {"extra": 0.3, "level": 0.2, "speed": 0.5},
+        {"extra": 0.1, "level": 0.1, "speed": 0.3},
+        dry(lambda q, v, m, extra, level, speed: level + extra * np.exp(-((v / speed) ** 2))),
+    ),
+    "viscous_friction": Row(
+        "shoulder", {"coefficient": 0.2}, {"coefficient": 0.05}, lambda q, v, m, coefficient: -coefficient * v
+    ),
+    "quadratic_drag": Row(
+        "elbow", {"coefficient": 0.05}, {"coefficient": 0.01}, lambda q, v, m, coefficient: -coefficient * v * abs(v)
+    ),
+    "asymmetric_damping": Row(
+        "shoulder",
+        {"forward": 0.3, "backward": 0.1},
+        {"forward": 0.05, "backward": 0.05},
+        lambda q, v, m, forward, backward: np.where(v > 0, -forward * v, -backward * v),
+    ),
+    "load_friction": Row("elbow", {"mu": 0.15}, {"mu": 0.05}, dry(lambda q, v, m, mu: mu * abs(m))),
+    "directional_load_friction": Row(
+        "elbow",
+        {"mu_driving": 0.1, "mu_driven": 0.2},
+        {"mu_driving": 0.05, "mu_driven": 0.05},
+        dry(lambda q, v, m, mu_driving, mu_driven: np.where(m * v > 0, mu_driving, mu_driven) * abs(m)),
+    ),
+    "position_friction": Row(
+        "shoulder",
+        {"amplitude": 0.8, "phase": 0.7},
+        {"amplitude": 0.3, "phase": 0.0},
+        dry(lambda q, v, m, amplitude, phase: amplitude * np.cos((q - phase) / 2) ** 2),
+    ),
+    "torque_ripple": Row(
+        "shoulder",
+        {"cosine": 0.4, "sine": -0.3, "turns": 7.0},
+        {"cosine": 0.1, "sine": 0.0, "turns": 6.6},
+        lambda q, v, m, cosine, sine, turns: cosine * np.cos(turns * q) + sine * np.sin(turns * q),
+    ),
+    "torque_offset": Row("elbow", {"offset": -0.2}, {"offset": 0.0}, lambda q, v, m, offset: offset + 0 * q),
+    "spring": Row(
+        "shoulder",
+        {"stiffness": 1.5, "reference": 0.4},
+        {"stiffness": 0.2, "reference": 0.0},
+        lambda q, v, m, stiffness, reference: -stiffness * (q - reference),
+    ),
+    "dc_motor": Row(
+        "shoulder_motor",
+        {"inverse_stall": 0.14, "inverse_speed": 0.1},
+        {"inverse_stall": 0.1, "inverse_speed": 0.05},
+        motor_limit,
+    ),
+    "command_delay": Row("shoulder_motor", {"delay": 0.026}, {"delay": 0.01}),
+    "command_deadband": Row("elbow_motor", {"width": 0.1}, {"width": 0.02}),
+    "command_gain": Row("shoulder_motor", {"change": -0.15}, {"change": 0.0}),
+    "command_saturation": Row("shoulder_motor", {"inverse_limit": 1.6}, {"inverse_limit": 1.2}),
+    "backlash": Row("elbow_motor", {"half_width": 0.15}, {"half_width": 0.05}),
+    "actuator_lag": Row("shoulder_motor", {"time_constant": 0.05}, {"time_constant": 0.01}),
+    "sensor_bias": Row("elbow", {"offset": 0.05}, {"offset": 0.0}),
+    "sensor_gain": Row("shoulder", {"change": 0.04}, {"change": 0.0}),
+    "payload": Row("lower", {"mass": 0.3, "along": 1.6}, {"mass": 0.1, "along": 1.0}),
+    "armature": Row("elbow", {"inertia": 0.02}, {"inertia": 0.005}),
+    "link_length": Row("lower", {"change": 0.12}, {"change": 0.0}),
+    "gravity_tilt": Row("", {"x": 0.08, "y": -0.05}, {"x": 0.0, "y": 0.0}),
+    "wind": Row("", {"x": 2.0, "y": -1.5, "z": 1.0}, {"x": 0.0, "y": 0.0, "z": 0.0}),
+    "fluid": Row("", {"density": 150.0, "viscosity": 0.5}, {"density": 30.0, "viscosity": 0.1}),
+    "geom_friction": Row("runner", {"change": 0.2}, {"change": 0.05}, model=SLED),
+}
+FORCES = [kind for kind, row in ROWS.items() if row.torque is not None]
+
+
+def shipped(kind: type[Effect]) -> bool:
+    return kind.__module__.startswith("sb3_rpto.")
+
+
+def test_table_is_whole() -> None:
+    assert set(ROWS) == {name for name, kind in LIBRARY.items() if shipped(kind)}, "every effect needs a row"
+
+
+def vector(kind: str, values: dict[str, float]) -> np.ndarray:
+    parameters = LIBRARY[kind].parameters
+    assert {p.name for p in parameters} == set(values)
+    return np.array([values[p.name] for p in parameters])
+
+
+def excitation(model: mujoco.MjModel, n: int, steps: int = 150) -> tuple[np.ndarray, np.ndarray, Drive]:
+    """Rest and motion at the start, then sums of sines and jumps that reverse often."""
+    rng = np.random.default_rng(3)
+    t = np.arange(steps) * model.opt.timestep
+    shape = (n, 1, model.nu)
+    commands = 0.6 * np.sin(2 * np.pi * (rng.uniform(0.5, 3, shape) * t[:, None] + rng.uniform(size=shape)))
+    commands += 0.4 * np.repeat(rng.uniform(-1, 1, (n, -(-steps // 25), model.nu)), 25, axis=1)[:, :steps]
+    moving = (np.arange(n) > 0)[:, None] * (model is ARM)
+    qpos = model.qpos0 + rng.uniform(-0.5, 0.5, (n, model.nq)) * moving
+    qvel = rng.uniform(-2, 2, (n, model.nv)) * moving
+    return qpos, qvel, Drive(commands)
+
+
+def shown(sim: Simulation, values: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, drive: Drive) -> np.ndarray:
+    """Positions as the sensors show them."""
+    q, v = sim.rollout(values, qpos, qvel, drive)
+    (effect,) = sim.effects
+    if effect.place == "sensor":
+        q[..., effect.adr], v[..., effect.dof] = effect.observe(q[..., effect.adr], v[..., effect.dof], values)
+    return q
+
+
+@pytest.mark.parametrize("kind", ROWS)
+def test_null_is_nothing_bit_for_bit(kind: str) -> None:
+    row = ROWS[kind]
+    sim = Simulation(row.model, [LIBRARY[kind](row.on)], 1)
+    start = excitation(row.model, 4)
+    plain = Simulation(row.model, [], 1).rollout(np.empty((4, 0)), *start)[0]
+    planted = vector(kind, row.planted)
+    values = np.tile(sim.null, (4, 1))
+    assert np.array_equal(shown(sim, values, *start), plain)
+    # Beside simulations where the effect acts, and whatever its shape would be.
+    values[0], values[1] = planted, np.where(sim.strength, sim.null, planted)
+    mixed = shown(sim, values, *start)
+    assert not np.allclose(mixed[0], plain[0], rtol=0, atol=1e-5)
+    assert np.array_equal(mixed[1:], plain[1:])
+    values[:] = sim.null
+    assert np.array_equal(shown(sim, values, *start), plain), "something stayed from the rollout before"
+
+
+@pytest.mark.parametrize("kind", ROWS)
+def test_planted_is_recovered(kind: str) -> None:
+    row, n = ROWS[kind], 8
+    sim = Simulation(row.model, [LIBRARY[kind](row.on)], 1)
+    qpos, qvel, drive = excitation(row.model, n)
+    truth, start = vector(kind, row.planted), vector(kind, row.start)
+    data = shown(sim, np.tile(truth, (n, 1)), qpos, qvel, drive)
+    low, high = ([getattr(p, bound) for p in LIBRARY[kind].parameters] for bound in ("lower", "upper"))
+
+    def many(points: np.ndarray) -> np.ndarray:
+        """Residuals (k, ...) at k points side by side."""
+        k = len(points)
+        rows = np.tile(np.arange(n), k)
+        return (
+            shown(sim, np.repeat(points, n, axis=0), qpos[rows], qvel[rows], drive.take(rows)) - data[rows]
+        ).reshape(k, -1)
+
+    def jacobian(point: np.ndarray) -> np.ndarray:
+        step = 1e-4 * np.maximum(np.abs(truth), 1e-3)
+        points = many(np.concatenate([point + np.diag(step), point[None]]))
+        return ((points[:-1] - points[-1]) / step[:, None]).T
+
+    fit = least_squares(lambda x: many(x[None])[0], start, jacobian, (low, high), x_scale=np.abs(truth), xtol=1e-10)
+    np.testing.assert_allclose(fit.x, truth, rtol=0.01)
+
+
+@pytest.mark.parametrize("kind", FORCES)
+def test_torque_follows_equation(kind: str) -> None:
+    row, n = ROWS[kind], 64
+    on = "motor" if LIBRARY[kind].place == "actuator" else "hinge"
+    effect = LIBRARY[kind](on)
+    rng = np.random.default_rng(5)
+    q = rng.uniform(-3, 3, (n, 1))
+    v = rng.uniform(0.2, 4, (n, 1)) * rng.choice([-1, 1], (n, 1))
+    commands = rng.uniform(-1.3, 1.3, (n, 1, 1))
+    sim = Simulation(HINGE, [effect], 1)
+    values = dict(row.planted)
+    if kind == "dc_motor":
+        values = {"inverse_stall": 0.8, "inverse_speed": 0.3}
+    x = np.tile(vector(kind, values), (n, 1))
+    with_effect, without = (
+        s.rollout(y, q, v, Drive(commands))[1][:, 1, 0]
+        for s, y in ((sim, x), (Simulation(HINGE, [], 1), np.empty((n, 0))))
+    )
+    measured = INERTIA * (with_effect - without) / HINGE.opt.timestep
+    motor = 2 * np.clip(commands[:, 0, 0], -1, 1)
+    expected = row.torque(q[:, 0], v[:, 0], motor, **values)
+    np.testing.assert_allclose(measured, expected, rtol=1e-6, atol=1e-7)
+
+
+def sent(kind: str, commands: np.ndarray, dt: float = 0.01, **values: float) -> np.ndarray:
+    """A command (steps,) after the effect."""
+    effect, memory = LIBRARY[kind]("", **values), {}
+    return np.array([effect.command(np.array([u]), effect.values[None], memory, dt)[0] for u in commands])
+
+
+RAMP = np.array([0.5, 1.0, 2.0, 1.5, -1.0, -3.0, 0.2])
+
+
+def test_delay_equation() -> None:
+    held = np.concatenate([np.full(3, RAMP[0]), RAMP])
+    np.testing.assert_allclose(sent("command_delay", RAMP, delay=0.02), held[1:-2])
+    np.testing.assert_allclose(sent("command_delay", RAMP, delay=0.025), (held[1:-2] + held[:-3]) / 2)
+    assert sent("command_delay", RAMP, delay=0.2)[-1] == RAMP[0]
+
+
+def test_other_command_equations() -> None:
+    np.testing.assert_allclose(sent("command_deadband", RAMP, width=0.8), [0, 0.2, 1.2, 0.7, -0.2, -2.2, 0])
+    np.testing.assert_allclose(sent("command_gain", RAMP, change=0.1), 1.1 * RAMP)
+    np.testing.assert_allclose(sent("command_saturation", RAMP, inverse_limit=0.8), np.clip(RAMP, -1.25, 1.25))
+    np.testing.assert_allclose(sent("backlash", RAMP, half_width=0.6), [0.5, 0.5, 1.4, 1.4, -0.4, -2.4, -0.4])
+
+
+def test_lag_is_filterexact() -> None:
+    """Ten steps of MuJoCo's own filter, started at the first command."""
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco><option timestep="0.01"/><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>
+    <actuator><general joint="j" dyntype="filterexact" dynprm="0.03" actearly="true"/></actuator></mujoco>""")
+    data = mujoco.MjData(model)
+    data.act[:] = RAMP[0]
+    expected = []
+    for u in RAMP:
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data)
+        expected.append(data.actuator_force[0])
+    np.testing.assert_allclose(sent("actuator_lag", RAMP, time_constant=0.03), expected, rtol=1e-12)
+
+
+def test_sensor_equations() -> None:
+    q, v = np.random.default_rng(0).normal(size=(2, 3, 5))
+    x = np.array([[0.1], [0.0], [-0.2]])
+    for kind, shown_q, shown_v in (("sensor_bias", q + x, v), ("sensor_gain", q * (1 + x), v * (1 + x))):
+        effect = LIBRARY[kind]("j")
+        seen = effect.observe(q, v, x)
+        np.testing.assert_array_equal(seen[0], shown_q)
+        np.testing.assert_array_equal(seen[1], shown_v)
+        np.testing.assert_allclose(effect.unobserve(*seen, x), (q, v), rtol=1e-14)
+
+
+def one_step(model: mujoco.MjModel, effects: list[Effect], n: int = 1) -> np.ndarray:
+    """Velocities after a step from a state in motion."""
+    sim = Simulation(model, effects, 1)
+    qpos = np.tile(model.qpos0 + 0.3 * (model.nq < 3), (n, 1))
+    drive = Drive(np.full((n, 1, model.nu), 0.5))
+    return sim.rollout(sim.values()[None].repeat(n, 0), qpos, np.full((n, model.nv), 1.5), drive)[1][:, -1]
+
+
+def test_payload_is_a_point_mass() -> None:
+    """The same as a tiny ball in the MJCF, also where the nominal inertia lies in the body's own frame."""
+    for end in ("0 0 -0.5", "0.2 0.1 -0.5"):
+        xml = f"""<mujoco><worldbody><body name="b"><joint axis="0 1 0"/><joint axis="1 0 0"/>
+        <geom type="capsule" fromto="0 0 0 {end}" size="0.04"/>BALL</body></worldbody></mujoco>"""
+        ball = f'<geom type="sphere" size="0.001" mass="0.3" pos="{end}"/>'
+        nominal, heavier = (mujoco.MjModel.from_xml_string(xml.replace("BALL", with_)) for with_ in ("", ball))
+        got = one_step(nominal, [LIBRARY["payload"]("b", mass=0.3, along=2.0)])
+        np.testing.assert_allclose(got, one_step(heavier, []), rtol=1e-6)
+
+
+def edited(model: mujoco.MjModel, change: Callable[[mujoco.MjModel], None]) -> mujoco.MjModel:
+    model = model.__copy__()
+    change(model)
+    return model
+
+
+def test_world_effects_are_mujocos_own() -> None:
+    def armature(m: mujoco.MjModel) -> None:
+        m.dof_armature[1] += 0.02
+
+    def wind(m: mujoco.MjModel) -> None:
+        m.opt.wind[:] += (2.0, -1.0, 0.5)
+
+    def fluid(m: mujoco.MjModel) -> None:
+        m.opt.density, m.opt.viscosity = m.opt.density + 100, m.opt.viscosity + 0.3
+
+    for effect, change in (
+        (LIBRARY["armature"]("elbow", inertia=0.02), armature),
+        (LIBRARY["wind"](x=2.0, y=-1.0, z=0.5), wind),
+        (LIBRARY["fluid"](density=100, viscosity=0.3), fluid),
+    ):
+        np.testing.assert_array_equal(one_step(ARM, [effect]), one_step(edited(ARM, change), []))
+
+
+def test_tilt_turns_gravity() -> None:
+    """About y by b, then about x by a: g (-sin b, sin a cos b, -cos a cos b)."""
+    a, b = 0.1, -0.2
+
+    def tilted(m: mujoco.MjModel) -> None:
+        m.opt.gravity[:] = 9.81 * np.array([-np.sin(b), np.sin(a) * np.cos(b), -np.cos(a) * np.cos(b)])
+
+    got = one_step(ARM, [LIBRARY["gravity_tilt"](x=a, y=b)])
+    np.testing.assert_allclose(got, one_step(edited(ARM, tilted), []), rtol=1e-12)
+
+
+def test_geom_friction_is_the_contacts() -> None:
+    """A sled that slides without an engine: the larger coefficient of the two decides, and none is negative."""
+    sim = Simulation(SLED, [LIBRARY["geom_friction"]("runner")], 1)
+    qpos, qvel = np.zeros((3, 2)), np.tile([2.0, 0.0], (3, 1))
+    drive = Drive(np.zeros((3, 50, 1)))
+    change = np.array([[0.2], [-0.25], [-0.7]])
+    v = sim.rollout(change, qpos, qvel, drive)[1]
+    for row, friction in zip(v, (0.5, 0.1, 0.1)):
+
+        def slide(m: mujoco.MjModel, friction: float = friction) -> None:
+            m.geom_friction[:, 0] = friction
+
+        expected = Simulation(edited(SLED, slide), [], 1).rollout(np.empty((3, 0)), qpos, qvel, drive)[1][0]
+        np.testing.assert_array_equal(row, expected)
+
+
+DIMENSIONLESS = {"mu", "mu_driving", "mu_driven", "change", "along"}
+
+
+@pytest.mark.parametrize("kind", ROWS)
+def test_statements(kind: str) -> None:
+    """Units, bounds, sizes, and the texts that reports show."""
+    effect = LIBRARY[kind]
+    assert effect.__doc__
+    assert effect.equation
+    assert effect.excite
+    assert not all(p.shape for p in effect.parameters)
+    for p in effect.parameters:
+        assert bool(p.unit) != (p.name in DIMENSIONLESS)
+        assert p.lower <= p.null <= p.upper
+        assert p.name in effect.equation or kind == "payload"
+        size = p.size_for(Scales())
+        assert size > 0
+        assert p.shape or p.lower <= p.null + size <= p.upper
+    # What only writes fields of the model can be kept in an MJCF, all else is carried around it.
+    carried = any(effect("x").overrides(hook) for hook in ("act", "command", "observe"))
+    assert bool(effect.native) != carried
+    assert effect.places(mujoco.MjModel.from_xml_string("<mujoco/>")) in ([], [""])
+
+
+@pytest.mark.parametrize("kind", ROWS)
+def test_json_round_trip(kind: str) -> None:
+    row = ROWS[kind]
+    effect = LIBRARY[kind](row.on, **row.planted)
+    again = from_json(effect.to_json())
+    assert again.label == effect.label
+    np.testing.assert_array_equal(again.values, effect.values)
+    assert effect.with_values(np.full(len(effect.values), -1e9)).values.tolist() == [
+        p.lower if np.isfinite(p.lower) else -1e9 for p in effect.parameters
+    ]
+
+
+def test_bounds_and_names_are_checked() -> None:
+    with pytest.raises(ValueError, match=r"level=-1 N·m is outside \[0, inf\]"):
+        LIBRARY["coulomb_friction"]("hinge", level=-1.0)
+    with pytest.raises(ValueError, match="has no parameter 'leve'; did you mean 'level'"):
+        LIBRARY["coulomb_friction"]("hinge", leve=1.0)
+    tendon = mujoco.MjModel.from_xml_string("""
+    <mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>
+    <tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>
+    <actuator><motor name="m" tendon="t"/></actuator></mujoco>""")
+    with pytest.raises(ValueError, match="dc_motor cannot sit on"):
+        LIBRARY["dc_motor"]("m").bind(tendon)
