@@ -28,6 +28,7 @@ _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARE
 _MAX_LAG = 25
 _FEWEST = 30
 _BUDGET = 40_000  # samples in all: about two seconds for a small robot
+_MOST_RUNS = 100  # evenly spread over the data
 _STRONG = 0.5  # correlation that counts
 _CERTAIN = 0.7  # and where no other run is there to compare with
 _GAIN = 0.1  # by which a lag must improve it
@@ -186,14 +187,15 @@ def _forces(model: mujoco.MjModel, data: Measurements) -> Iterator[_Force]:
     order = {
         name: [getattr(data.columns, name).index(n) for n in getattr(own, name)] for name in ("qpos", "qvel", "ctrl")
     }
-    budget = max(500, _BUDGET // max(1, len({e.run for e in data.episodes})))
-    spent: dict[str, int] = {}
+    runs = list(dict.fromkeys(e.run for e in data.episodes if len(e) >= _FEWEST))
+    runs = runs[:: -(-len(runs) // _MOST_RUNS) or 1]
+    left = dict.fromkeys(runs, _BUDGET // max(1, len(runs)))
     for episode in data.episodes:
-        rows = slice(0, budget - spent.get(episode.run, 0))
+        rows = slice(0, left.get(episode.run, 0))
         n = len(episode.time[rows])
         if n < _FEWEST:
             continue
-        spent[episode.run] = spent.get(episode.run, 0) + n
+        left[episode.run] -= n
         time = episode.time[rows]
         step = float(np.median(np.diff(time)))
         window = 5 if data.exact else int(np.clip(SMOOTHING / step, WINDOW, 101)) // 2 * 2 + 1
