@@ -1,0 +1,165 @@
+"""Which effects a model may lack, and how a user adds another."""
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+import pytest
+
+from sb3_rpto.effects import LIBRARY, Drive, Effect, Parameter, Simulation, World, candidates, from_json, register
+
+XML = """
+<mujoco>
+  <option OPTION/>
+  <worldbody>
+    <geom name="floor" type="plane" pos="0 0 -2" size="1 1 1" contype="0" conaffinity="1"/>
+    <body name="post"><geom name="post" type="box" size="0.1 0.1 0.1" contype="0" conaffinity="0"/></body>
+    <body name="cart">
+      <joint name="slide" type="slide" axis="1 0 0"/>
+      <geom name="box" type="box" size="0.1 0.1 0.1"/>
+      <body name="pole">
+        <joint axis="0 1 0"/>
+        <geom name="rod" type="capsule" fromto="0 0 0 0 0 0.5" size="0.03" conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon><fixed name="t"><joint joint="slide" coef="1"/></fixed></tendon>
+  <actuator><motor name="motor" joint="slide"/>MORE</actuator>
+</mujoco>"""
+
+
+def model(option: str = "", more: str = "") -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(XML.replace("OPTION", option).replace("MORE", more))
+
+
+def offered(model: mujoco.MjModel, *exclude: str) -> set[str]:
+    found = [e.label for e in candidates(model, exclude)]
+    assert len(found) == len(set(found))
+    return set(found)
+
+
+def test_all_at_all_places() -> None:
+    got = offered(model())
+    joints = ("slide", "joint1")  # nameless ones have a name too
+    for kind in ("coulomb_friction", "stribeck_friction", "viscous_friction", "quadratic_drag", "asymmetric_damping"):
+        assert {f"{kind}({joint})" for joint in joints} <= got
+    for kind in ("torque_offset", "spring", "armature", "sensor_bias", "sensor_gain"):
+        assert {f"{kind}({joint})" for joint in joints} <= got
+    for kind in ("torque_ripple", "position_friction"):
+        assert {label for label in got if label.startswith(kind)} == {f"{kind}(joint1)"}
+    for kind in ("load_friction", "directional_load_friction"):
+        assert {label for label in got if label.startswith(kind)} == {f"{kind}(slide)"}
+    for kind in ("command_delay", "command_gain", "actuator_lag", "backlash", "dc_motor"):
+        assert f"{kind}(motor)" in got
+    assert {label for label in got if label.startswith("payload")} == {"payload(cart)", "payload(pole)"}
+    assert {label for label in got if label.startswith("link_length")} == {"link_length(pole)"}
+    assert {label for label in got if label.startswith("geom_friction")} == {
+        "geom_friction(floor)",
+        "geom_friction(box)",
+        "geom_friction(rod)",
+    }
+    assert {"gravity_tilt", "fluid"} <= got
+    assert "wind" not in got
+    assert all(e.values.tolist() == [p.null for p in e.parameters] for e in candidates(model()))
+
+
+def test_all_can_be_simulated_together() -> None:
+    compiled = model('density="1"')
+    sim = Simulation(compiled, candidates(compiled), 1)
+    drive = Drive(np.random.default_rng(0).normal(size=(3, 20, 1)))
+    start = np.zeros((3, 2)), np.ones((3, 2))
+    plain = Simulation(compiled, [], 1).rollout(np.empty((3, 0)), *start, drive)
+    np.testing.assert_array_equal(sim.rollout(np.tile(sim.null, (3, 1)), *start, drive)[0], plain[0])
+
+
+def test_without_contacts_gravity_or_memoryless_motors() -> None:
+    assert not any(
+        label.startswith("geom_friction") for label in offered(model('><flag contact="disable"/></option><size'))
+    )
+    assert "gravity_tilt" not in offered(model('gravity="0 0 0"'))
+    assert "gravity_tilt" not in offered(model('><flag gravity="disable"/></option><size'))
+    assert "wind" in offered(model('density="1"'))
+    more = '<motor name="pull" tendon="t"/><general name="slow" joint="slide" dyntype="filter" dynprm="0.1"/>'
+    got = offered(model(more=more))
+    assert {"command_delay(pull)", "command_delay(slow)", "dc_motor(motor)"} <= got
+    assert not {"dc_motor(pull)", "dc_motor(slow)"} & got
+
+
+@pytest.mark.parametrize(
+    ("declared", "gone"),
+    [
+        ("slide.damping", {"viscous_friction(slide)"}),
+        ("joint:slide.damping", {"viscous_friction(slide)"}),
+        ("*.armature", {"armature(slide)", "armature(joint1)"}),
+        ("slide.frictionloss=0:9", {"coulomb_friction(slide)"}),
+        ("slide.stiffness", {"spring(slide)"}),
+        ("pole.length", {"link_length(pole)"}),
+        ("pole.mass", set()),
+        ("box.friction", {"geom_friction(box)"}),
+        ("motor.gear", {"command_gain(motor)"}),
+        ("motor.strength", {"command_gain(motor)"}),
+        ("motor.damping", set()),
+        ("option.viscosity", {"fluid"}),
+        ("option.gravity", set()),
+    ],
+)
+def test_what_is_declared_is_left_out(declared: str, gone: set[str]) -> None:
+    assert offered(model()) - offered(model(), declared) == gone
+
+
+def test_unknown_exclusions_are_said() -> None:
+    with pytest.raises(ValueError, match="did you mean 'slide'"):
+        candidates(model(), ["slid.damping"])
+
+
+@pytest.fixture
+def cubic() -> Iterator[type[Effect]]:
+    """An effect of a user, in ten lines."""
+
+    @register
+    class CubicDrag(Effect):
+        kind = "cubic_drag"
+        place = "joint"
+        parameters = (Parameter("c", "N·m·s³/rad³", lambda s: 0.03 * s.torque / s.velocity**3, lower=0.0),)
+        equation = "-c qd^3"
+
+        def act(self, world: World, x: np.ndarray) -> None:
+            world.force[:, self.dof] -= x[:, 0] * world.qvel[:, self.dof] ** 3
+
+    yield CubicDrag
+    del LIBRARY["cubic_drag"]
+
+
+def test_a_users_effect_is_offered_and_acts(cubic: type[Effect]) -> None:
+    compiled = model('gravity="0 0 0"')
+    assert {"cubic_drag(slide)", "cubic_drag(joint1)"} <= offered(compiled)
+    sim = Simulation(compiled, [cubic("slide")], 1)
+    qvel = np.tile([2.0, 0.0], (2, 1))
+    v = sim.rollout(np.array([[0.0], [0.5]]), np.zeros((2, 2)), qvel, Drive(np.zeros((2, 1, 1))))[1][:, 1, 0]
+    data = mujoco.MjData(compiled)
+    data.qvel[:], data.qfrc_applied[0] = qvel[0], -0.5 * 2.0**3
+    mujoco.mj_step(compiled, data)
+    assert v.tolist() == pytest.approx([2.0, data.qvel[0]])
+    assert from_json(cubic("slide", c=0.5).to_json()).values == [0.5]
+
+
+def test_registering_is_checked(cubic: type[Effect]) -> None:
+    with pytest.raises(ValueError, match="Half needs a class attribute 'parameters'"):
+
+        @register
+        class Half(Effect):
+            kind = "half"
+            place = "joint"
+
+    with pytest.raises(ValueError, match="there is an effect 'cubic_drag' already"):
+
+        @register
+        class Other(Effect):
+            kind = "cubic_drag"
+            place = "joint"
+            parameters = ()
+            equation = ""
+
+    assert LIBRARY["cubic_drag"] is cubic
+    with pytest.raises(ValueError, match="no effect 'cubic_drg' is registered; did you mean 'cubic_drag'"):
+        from_json({"kind": "cubic_drg", "on": "", "values": {}})

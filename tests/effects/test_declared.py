@@ -1,0 +1,171 @@
+"""Declared parameters: their names, bounds, and what is said when they are wrong."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sb3_rpto.effects import Declared, declare, parameter_names
+from sb3_rpto.effects.world import BatchWorld, LiveWorld, World
+
+MODEL = mujoco.MjModel.from_xml_string("""
+<mujoco>
+  <option density="1.2"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="hinge" axis="0 1 0" damping="0.2"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03"/>
+      <body name="shared" pos="0 0 -0.5">
+        <joint name="shared" axis="0 1 0" armature="0.01"/>
+        <geom type="sphere" size="0.05"/>
+      </body>
+    </body>
+    <body name="ball"><joint name="loose" type="free"/><geom size="0.1"/></body>
+  </worldbody>
+  <actuator>
+    <motor name="motor" joint="hinge" gear="3"/>
+    <position name="servo" joint="shared" kp="5"/>
+  </actuator>
+</mujoco>""")
+
+
+def labels(names: list[str]) -> list[str]:
+    return [d.label for d in declare(MODEL, names)]
+
+
+def test_nominal_values_and_units() -> None:
+    found = declare(
+        MODEL, ["hinge.damping", "motor.gear", "servo.kp", "arm.length", "option.gravity", "option.density"]
+    )
+    assert [d.values[0] for d in found] == pytest.approx([0.2, 3.0, 5.0, 0.5, 9.81, 1.2])
+    assert [d.parameters[0].unit for d in found] == ["N·m·s/rad", "", "N·m/rad", "m", "m/s²", "kg/m³"]
+    assert repr(found[0]) == "hinge.damping = 0.2 N·m·s/rad"
+
+
+def test_default_bounds() -> None:
+    (damping,), (mass,), (length,) = (declare(MODEL, [n]) for n in ("hinge.damping", "arm.mass", "arm.length"))
+    assert (damping.parameters[0].lower, damping.parameters[0].upper) == (0.0, np.inf)
+    nominal = MODEL.body("arm").mass[0]
+    assert (mass.parameters[0].lower, mass.parameters[0].upper) == pytest.approx((nominal / 10, nominal * 10))
+    assert (length.parameters[0].lower, length.parameters[0].upper) == (0.25, 1.0)
+    assert damping.with_values(np.array([-3.0])).values == [0.0]
+
+
+def test_given_bounds() -> None:
+    (damping,) = declare(MODEL, ["hinge.damping=0.1:0.9"])
+    assert (damping.parameters[0].lower, damping.parameters[0].upper) == (0.1, 0.9)
+    for wrong, said in (
+        ("hinge.damping=0.1", "write bounds as <name>=<lower>:<upper>"),
+        ("hinge.damping=a:b", "write bounds as <name>=<lower>:<upper>"),
+        ("hinge.damping=0.3:0.9", r"\[0.3, 0.9\] do not hold the nominal value 0.2"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            declare(MODEL, [wrong])
+
+
+def test_wildcards() -> None:
+    assert labels(["*.frictionloss"]) == ["hinge.frictionloss", "shared.frictionloss"]
+    assert labels(["hinge.*"]) == ["hinge.damping", "hinge.frictionloss", "hinge.armature", "hinge.stiffness"]
+    assert labels(["*.length"]) == ["arm.length"], "no capsule, no length"
+    assert labels(["hinge.d*", "hinge.damping"]) == ["hinge.damping"], "none twice"
+    with pytest.raises(ValueError, match=r"'\*.wobble' matches nothing"):
+        declare(MODEL, ["*.wobble"])
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("hinge", "write <object>.<parameter>"),
+        ("hing.damping", "did you mean 'hinge'"),
+        ("hinge.dampin", "did you mean 'damping'"),
+        ("option.gravty", "did you mean 'gravity'"),
+        ("body:hinge.mass", "the model has no body 'hinge'"),
+        ("loose.damping", "neither a hinge nor a slide"),
+        ("shared.length", "is 0 in the model, so it cannot be scaled"),
+    ],
+)
+def test_wrong_names_are_answered(name: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        declare(MODEL, [name])
+
+
+def test_a_string_is_no_list() -> None:
+    with pytest.raises(TypeError, match=r"write \['hinge.damping'\]"):
+        declare(MODEL, "hinge.damping")
+
+
+def test_prefixes_tell_objects_of_one_name_apart() -> None:
+    mass, armature = declare(MODEL, ["body:shared.mass", "joint:shared.armature"])
+    assert mass.values == [MODEL.body("shared").mass]
+    assert armature.values == [0.01]
+    assert labels(["shared.mass"]) == ["shared.mass"], "only a body has a mass"
+    # A joint and an actuator both have a damping.
+    twins = mujoco.MjModel.from_xml_string("""
+    <mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>
+    <actuator><motor name="j" joint="j"/></actuator></mujoco>""")
+    with pytest.raises(ValueError, match=r"may be of joint or actuator; write 'joint:j.damping'"):
+        declare(twins, ["j.damping"])
+    assert {"joint:j.damping", "actuator:j.damping", "j.armature"} <= set(parameter_names(twins))
+
+
+def test_every_name_can_be_declared() -> None:
+    for name in parameter_names(MODEL):
+        try:
+            declared = Declared(MODEL, name)
+        except ValueError as error:
+            assert "cannot be scaled" in str(error)  # noqa: PT017 (the others must not raise)
+        else:
+            assert declared.label == name
+
+
+def written(world: World, name: str, value: float) -> World:
+    world.restore()
+    Declared(MODEL, name, (0.0, np.inf)).write(world, np.array([[value]]))
+    world.settle()
+    return world
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "field", "where", "expected"),
+    [
+        ("hinge.damping", 0.7, "dof_damping", 0, 0.7),
+        ("hinge.frictionloss", 0.4, "dof_frictionloss", 0, 0.4),
+        ("hinge.stiffness", 2.0, "jnt_stiffness", 0, 2.0),
+        ("motor.gear", 4.0, "actuator_gear", (0, 0), 4.0),
+        ("motor.strength", 0.5, "actuator_gainprm", (0, 0), 0.5),
+        ("servo.kp", 7.0, "actuator_biasprm", (1, 1), -7.0),
+        ("rod.friction", 0.3, "geom_friction", (0, 0), 0.3),
+        ("option.gravity", 4.905, "opt.gravity", 2, -4.905),
+        ("option.density", 3.0, "opt.density", (), 3.0),
+        ("option.viscosity", 0.2, "opt.viscosity", (), 0.2),
+    ],
+)
+def test_writing(name: str, value: float, field: str, where: tuple[int, ...], expected: float) -> None:
+    for world in (BatchWorld(MODEL, 1, 1), LiveWorld(MODEL.__copy__(), mujoco.MjData(MODEL))):
+        at = (0, *where) if isinstance(where, tuple) else (0, where)
+        before = float(world.field(field)[at])
+        assert written(world, name, value).field(field)[at] == pytest.approx(expected)
+        world.restore()
+        assert world.field(field)[at] == before
+
+
+def test_plain_numbers_reach_the_model() -> None:
+    model = MODEL.__copy__()
+    world = LiveWorld(model, mujoco.MjData(model))
+    written(world, "option.density", 40.0)
+    assert model.opt.density == 40.0
+    world.restore()
+    assert model.opt.density == 1.2
+
+
+@given(st.floats(0.15, 9))
+def test_mass_scales_inertia_and_inertia_leaves_mass(factor: float) -> None:
+    body = MODEL.body("arm").id
+    mass, inertia = MODEL.body_mass[body], MODEL.body_inertia[body]
+    heavy = written(BatchWorld(MODEL, 1, 1), "arm.mass", factor * mass)
+    np.testing.assert_allclose(heavy.field("body_mass")[0, body], factor * mass)
+    np.testing.assert_allclose(heavy.field("body_inertia")[0, body], factor * inertia)
+    round_ = written(BatchWorld(MODEL, 1, 1), "arm.inertia", factor * inertia[0])
+    assert round_.batch.expand("body_mass")[0, body] == mass
+    np.testing.assert_allclose(round_.field("body_inertia")[0, body], factor * inertia)

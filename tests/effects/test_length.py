@@ -1,0 +1,140 @@
+"""Stretched links equal recompiled ones."""
+
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+from sb3_rpto.effects import LIBRARY, Declared
+from sb3_rpto.effects.inertia import from_tensor, matrices, to_tensor
+from sb3_rpto.effects.length import link_length, write_length
+from sb3_rpto.effects.world import BatchWorld
+
+ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
+LINKS = [
+    ("half_cheetah.xml", "bthigh"),
+    ("half_cheetah.xml", "torso"),  # two capsules in two directions, eight children
+    ("hopper.xml", "leg"),  # its origin is its middle
+    ("hopper.xml", "torso"),
+    ("walker2d_v5.xml", "leg"),
+    ("inverted_double_pendulum.xml", "pole"),
+    ("swimmer.xml", "mid"),
+]
+
+
+def recompiled(path: Path, name: str, scale: float) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+    """The model, and one compiled from a spec whose link is ``scale`` as long along its longest capsule."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.compiler.settotalmass = -1
+    model = spec.compile()
+    body = model.body(name).id
+    first, count = model.body_geomadr[body], model.body_geomnum[body]
+    geoms = range(first, first + count)
+    axes = matrices(model.geom_quat)[:, :, 2]
+    longest = max((g for g in geoms if model.geom_type[g] == CAPSULE), key=lambda g: model.geom_size[g, 1])
+    stretch = np.eye(3) + (scale - 1) * np.outer(axes[longest], axes[longest])
+    link = spec.body(name)
+    for geom, g in zip(link.geoms, geoms, strict=True):
+        half = model.geom_size[g, 1] * axes[g]
+        geom.fromto = [*(stretch @ (model.geom_pos[g] - half)), *(stretch @ (model.geom_pos[g] + half))]
+        geom.pos, geom.quat = [0, 0, 0], [1, 0, 0, 0]
+    anchor = model.jnt_pos[model.body_jntadr[body]]
+    link.pos = link.pos + matrices(model.body_quat[body][None])[0] @ (anchor - stretch @ anchor)
+    for thing in (*link.joints, *link.bodies, *link.sites):
+        thing.pos = stretch @ thing.pos
+    return model, spec.compile()
+
+
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
+@pytest.mark.parametrize("scale", [0.7, 1.3])
+@pytest.mark.parametrize(("file", "name"), LINKS)
+def test_stretched_equals_recompiled(file: str, name: str, scale: float) -> None:
+    model, expected = recompiled(ASSETS / file, name, scale)
+    body = model.body(name).id
+    nominal = link_length(model, body)
+    world = BatchWorld(model, 2, 1)
+    outputs = {n: world.batch.bind(n) for n in ("qacc", "geom_xpos", "site_xpos", "xanchor")}
+    write_length(world, body, np.array([nominal, scale * nominal]), nominal)
+    world.settle()
+
+    np.testing.assert_allclose(link_length(expected, body), scale * nominal, rtol=1e-12)
+    for field in ("body_mass", "body_ipos", "body_subtreemass", "geom_size", "geom_pos", "geom_rbound", "body_pos"):
+        np.testing.assert_allclose(world.field(field)[1], getattr(expected, field), rtol=1e-9, atol=1e-12)
+    tensor = to_tensor(world.field("body_inertia")[1], world.field("body_iquat")[1])
+    np.testing.assert_allclose(tensor, to_tensor(expected.body_inertia, expected.body_iquat), rtol=1e-9, atol=1e-12)
+    for field in ("body_mass", "body_ipos", "body_iquat", "body_inertia", "geom_quat", "jnt_pos"):
+        assert np.array_equal(world.field(field)[0], getattr(model, field)), "the nominal length changes nothing"
+
+    rng = np.random.default_rng(0)
+    data = mujoco.MjData(expected)
+    for _ in range(5):
+        data.qpos[:], data.qvel[:] = model.qpos0 + 0.3 * rng.normal(size=model.nq), rng.normal(size=model.nv)
+        world.qpos[:], world.qvel[:] = data.qpos, data.qvel
+        data.qacc_warmstart[:] = 0
+        mujoco.mj_forward(expected, data)
+        world.batch.forward()
+        for output, values in outputs.items():
+            # Contacts amplify rounding.
+            np.testing.assert_allclose(values[1], getattr(data, output), rtol=1e-5, atol=1e-8)
+
+
+def test_inertia_of_offset_balls_and_boxes() -> None:
+    """Geoms that are no capsules move with the link and keep their size; the density is the body's."""
+    xml = """<mujoco><worldbody><body name="b"><joint axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 0 0 {0}" size="0.03"/>
+    <geom type="sphere" pos="0.1 0 {0}" size="0.06"/>
+    <geom type="box" pos="0 0.1 {1}" size="0.02 0.03 0.05" euler="20 0 0"/>
+    <geom type="cylinder" pos="0 0 {1}" size="0.05 0.02"/>
+    <geom type="ellipsoid" pos="0 0 {1}" size="0.05 0.02 0.07"/>
+    </body></worldbody></mujoco>"""
+    model, longer = (mujoco.MjModel.from_xml_string(xml.format(0.4 * s, 0.2 * s)) for s in (1, 1.5))
+    world = BatchWorld(model, 1, 1)
+    write_length(world, 1, np.array([0.6]), 0.4)
+    np.testing.assert_allclose(world.field("body_mass")[0], longer.body_mass, rtol=1e-12)
+    np.testing.assert_allclose(world.field("body_ipos")[0], longer.body_ipos, atol=1e-12)
+    np.testing.assert_allclose(
+        to_tensor(world.field("body_inertia")[0, 1:], world.field("body_iquat")[0, 1:]),
+        to_tensor(longer.body_inertia[1:], longer.body_iquat[1:]),
+        rtol=1e-9,
+        atol=1e-12,
+    )
+
+
+def test_a_body_without_capsule_is_refused() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body name="ball"><joint/><geom size="0.1"/></body></worldbody></mujoco>'
+    )
+    assert link_length(model, 1) == 0
+    with pytest.raises(ValueError, match=r"ball\.length is 0 in the model"):
+        Declared(model, "ball.length")
+    with pytest.raises(ValueError, match="no capsule to stretch"):
+        LIBRARY["link_length"]("ball").bind(model)
+    assert LIBRARY["link_length"].places(model) == []
+
+
+def test_declared_length_and_effect_are_the_same() -> None:
+    model = mujoco.MjModel.from_xml_path(str(ASSETS / "inverted_double_pendulum.xml"))
+    declared, effect = Declared(model, "pole.length"), LIBRARY["link_length"]("pole")
+    effect.bind(model)
+    worlds = BatchWorld(model, 1, 1), BatchWorld(model, 1, 1)
+    declared.write(worlds[0], np.array([[0.72]]))
+    effect.write(worlds[1], np.array([[0.2]]))
+    for field in ("body_mass", "body_inertia", "body_pos", "geom_size"):
+        np.testing.assert_allclose(worlds[0].field(field), worlds[1].field(field), rtol=1e-12)
+    assert worlds[0].field("body_pos")[0, 3, 2] == pytest.approx(0.72)
+
+
+def test_principal_frames_invert() -> None:
+    rng = np.random.default_rng(1)
+    tensor = rng.normal(size=(20, 3, 3))
+    tensor = tensor @ np.swapaxes(tensor, 1, 2) + np.eye(3)
+    moments, quat = from_tensor(tensor)
+    np.testing.assert_allclose(to_tensor(moments, quat), tensor, rtol=1e-10, atol=1e-12)
+    assert (np.diff(moments, axis=1) <= 0).all()
+    for q, matrix in zip(quat, matrices(quat)):
+        expected = np.empty(9)
+        mujoco.mju_quat2Mat(expected, q)
+        np.testing.assert_allclose(matrix.ravel(), expected, atol=1e-14)

@@ -1,0 +1,185 @@
+"""Many simulations side by side are the same as MuJoCo one by one."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from sb3_rpto.effects import LIBRARY, Drive, Effect, Simulation, declare
+
+XML = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="shoulder" axis="0 1 0" damping="0.1" frictionloss="0.05"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" contype="0"/>
+      <body name="lower" pos="0 0 -0.4">
+        <joint name="elbow" axis="0 1 0" damping="0.02"/>
+        <geom name="fist" type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03"/>
+      </body>
+    </body>
+    <geom name="wall" type="plane" pos="-0.2 0 0" zaxis="1 0 0" size="1 1 1"/>
+  </worldbody>
+  <actuator>ACTUATORS</actuator>
+</mujoco>"""
+MOTORS = '<motor name="m1" joint="shoulder" gear="6"/><position name="m2" joint="elbow" kp="8" kv="0.3"/>'
+MODEL = mujoco.MjModel.from_xml_string(XML.replace("ACTUATORS", MOTORS))
+FREE = mujoco.MjModel.from_xml_string(XML.replace("ACTUATORS", ""))
+
+
+def start(n: int, steps: int = 120) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(7)
+    return rng.normal(size=(n, 2)), rng.normal(size=(n, 2)), rng.uniform(-1, 1, (n, steps, 2))
+
+
+def loop(
+    model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, commands: np.ndarray, torque: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The plain way."""
+    out = []
+    for q, v, u in zip(qpos, qvel, commands):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = q, v
+        states = [(q, v)]
+        for command in u:
+            data.ctrl[:], data.qfrc_applied[1] = command[: model.nu], torque
+            mujoco.mj_step(model, data)
+            states.append((data.qpos.copy(), data.qvel.copy()))
+        out.append(states)
+    both = np.array(out)
+    return both[:, :, 0], both[:, :, 1]
+
+
+def equal(got: tuple[np.ndarray, np.ndarray], expected: tuple[np.ndarray, np.ndarray]) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(got, expected))
+
+
+def test_without_effects_it_is_mujoco_bit_for_bit() -> None:
+    qpos, qvel, commands = start(5)
+    sim = Simulation(MODEL, [], 2)
+    got = sim.rollout(np.empty((5, 0)), qpos, qvel, Drive(commands))
+    assert equal(got, loop(MODEL, qpos, qvel, commands))
+    assert equal(got, sim.rollout(np.empty((5, 0)), qpos, qvel, Drive(commands))), "a second time"
+
+
+def test_forces_are_mujocos_bit_for_bit() -> None:
+    qpos, qvel, commands = start(3)
+    sim = Simulation(MODEL, [LIBRARY["torque_offset"]("elbow", offset=0.3)], 1)
+    stiff = sim.rollout(np.full((3, 1), 0.3), qpos, qvel, Drive(commands))
+    # A joint with an effect in act has its dry friction made stiff; the other one has not.
+    assert equal(stiff, loop(MODEL, qpos, qvel, commands, torque=0.3))
+
+
+def test_declared_numbers_are_those_of_an_edited_model() -> None:
+    qpos, qvel, commands = start(3)
+    sim = Simulation(MODEL, declare(MODEL, ["elbow.damping", "m1.gear", "lower.mass"]), 1)
+    values = sim.values()
+    assert values[:2].tolist() == [0.02, 6.0]
+    assert equal(sim.rollout(np.tile(values, (3, 1)), qpos, qvel, Drive(commands)), loop(MODEL, qpos, qvel, commands))
+    other = MODEL.__copy__()
+    body = other.body("lower").id
+    other.dof_damping[1], other.actuator_gear[0, 0] = 0.3, 4.0
+    other.body_mass[body] *= 2
+    other.body_inertia[body] *= 2
+    mujoco.mj_setConst(other, mujoco.MjData(other))
+    got = sim.rollout(np.tile([0.3, 4.0, 2 * values[2]], (3, 1)), qpos, qvel, Drive(commands))
+    for a, b in zip(got, loop(other, qpos, qvel, commands)):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_settings_differ_by_simulation() -> None:
+    qpos, qvel, commands = start(2)
+    damping = np.array([0.02, 0.5])
+    got = Simulation(MODEL, [], 1).rollout(
+        np.empty((2, 0)), qpos, qvel, Drive(commands, settings={"elbow.damping": damping})
+    )
+    for i, value in enumerate(damping):
+        other = MODEL.__copy__()
+        other.dof_damping[1] = value
+        expected = loop(other, qpos[i : i + 1], qvel[i : i + 1], commands[i : i + 1])
+        np.testing.assert_array_equal(got[0][i], expected[0][0])
+
+
+def test_actuators_that_are_off_do_nothing() -> None:
+    qpos, qvel, commands = start(3, 80)
+    sim = Simulation(MODEL, [], 1)
+    off = Drive(commands, enabled=np.zeros(commands.shape))
+    got = sim.rollout(np.empty((3, 0)), qpos, qvel, off)
+    for a, b in zip(got, loop(FREE, qpos, qvel, commands)):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+    # Off until the middle, then on.
+    enabled = np.ones(commands.shape)
+    enabled[:, :40] = 0
+    switched = sim.rollout(np.empty((3, 0)), qpos, qvel, Drive(commands, enabled=enabled))
+    np.testing.assert_array_equal(switched[0][:, :41], got[0][:, :41])
+    later = loop(MODEL, switched[0][:, 40], switched[1][:, 40], commands[:, 40:])
+    np.testing.assert_allclose(switched[0][:, 40:], later[0], rtol=1e-4, atol=1e-5)  # another warm start
+    # The next rollout has them on again.
+    assert equal(sim.rollout(np.empty((3, 0)), qpos, qvel, Drive(commands)), loop(MODEL, qpos, qvel, commands))
+
+
+def test_load_friction_ends_where_the_motor_is_off() -> None:
+    qpos, qvel, commands = start(2, 30)
+    sim = Simulation(
+        MODEL, [LIBRARY["load_friction"]("elbow", mu=0.5), LIBRARY["dc_motor"]("m1", inverse_stall=1.0)], 1
+    )
+    drive = Drive(commands, enabled=np.zeros(commands.shape))
+    values = np.tile(sim.values(), (2, 1))
+    got = sim.rollout(values, qpos, qvel, drive)[0]
+    plain = sim.rollout(np.tile(sim.null, (2, 1)), qpos, qvel, drive)[0]
+    np.testing.assert_allclose(got, plain, rtol=1e-12)
+
+
+def test_what_blows_up_is_nan_from_then_on() -> None:
+    qpos, qvel, commands = start(3)
+    commands[1, 50:] = 1e9
+    q, v = Simulation(MODEL, [], 1).rollout(np.empty((3, 0)), qpos, qvel, Drive(commands))
+    expected = loop(MODEL, qpos, qvel, commands)
+    for i in (0, 2):
+        np.testing.assert_array_equal(q[i], expected[0][i])
+    bad = np.isnan(q[1]).any(axis=1)
+    assert not bad[:51].any()
+    assert bad[52:].all()
+    np.testing.assert_array_equal(np.isnan(q[1]), np.isnan(v[1]))
+
+
+def test_commands_before_the_start_fill_delays() -> None:
+    qpos, qvel, commands = start(2)
+    sim = Simulation(MODEL, [LIBRARY["command_delay"]("m1")], 1)
+    delayed = commands.copy()
+    delayed[:, 4:, 0] = commands[:, :-4, 0]
+    got = sim.rollout(np.full((2, 1), 4 * 0.005), qpos, qvel, Drive(commands, before=10))
+    np.testing.assert_allclose(got[0], loop(MODEL, qpos, qvel, delayed[:, 10:])[0], rtol=1e-9, atol=1e-12)
+    assert got[0].shape == (2, 111, 2)
+
+
+def test_commands_pass_the_chain_in_its_order() -> None:
+    """A saturation after a gain, whatever the order of the list."""
+    qpos, qvel, commands = start(2)
+    chain: list[Effect] = [
+        LIBRARY["command_saturation"]("m1", inverse_limit=2.0),
+        LIBRARY["command_gain"]("m1", change=0.5),
+    ]
+    sent = commands.copy()
+    sent[..., 0] = np.clip(1.5 * commands[..., 0], -0.5, 0.5)
+    for effects in (chain, chain[::-1]):
+        sim = Simulation(MODEL, effects, 1)
+        got = sim.rollout(np.tile(sim.values(), (2, 1)), qpos, qvel, Drive(commands))
+        assert equal(got, loop(MODEL, qpos, qvel, sent))
+
+
+def test_spring_adds_to_the_models_own() -> None:
+    qpos, qvel, commands = start(2)
+    model = MODEL.__copy__()
+    model.jnt_stiffness[1], model.qpos_spring[1] = 2.0, 0.5
+    sim = Simulation(model, [LIBRARY["spring"]("elbow")], 1)
+    got = sim.rollout(np.array([[0.0, 9.0], [3.0, -0.5]]), qpos, qvel, Drive(commands))
+    assert np.array_equal(got[0][0], loop(model, qpos[:1], qvel[:1], commands[:1])[0][0])
+    both = model.__copy__()
+    both.jnt_stiffness[1], both.qpos_spring[1] = 5.0, (2.0 * 0.5 + 3.0 * -0.5) / 5.0
+    np.testing.assert_allclose(got[0][1], loop(both, qpos[1:], qvel[1:], commands[1:])[0][0], rtol=1e-9)
+
+
+def test_a_place_that_is_not_there_is_named() -> None:
+    with pytest.raises(ValueError, match="the model has no joint 'ellbow'; did you mean 'elbow'"):
+        Simulation(MODEL, [LIBRARY["viscous_friction"]("ellbow")])
