@@ -6,7 +6,7 @@ from sb3_rpto.experiments.planting import KINDS, SYSTEMS, generate
 from sb3_rpto.experiments.planting.plants import CoulombFriction, PositionFriction
 from sb3_rpto.experiments.planting.simulation import Simulation
 
-SHORT = {"episodes": 5, "duration": 1.0}
+SHORT = {"episodes": 4, "duration": 0.8}
 
 
 def measured(planted):
