@@ -1,0 +1,162 @@
+"""Errors of predictions from measured states, per joint and horizon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sb3_rpto.effects import Scales, Simulation
+from sb3_rpto.tracing.identify import TRUST, Problem
+from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.windows import Windows, cut
+
+#: Horizons in s; the whole run comes after them.
+HORIZONS = (0.1, 0.5, 1.0)
+MOST = 200
+RESAMPLES = 400
+
+
+@dataclass(frozen=True)
+class HorizonError:
+    """Errors of predictions over one horizon.
+
+    :param horizon: in s, or ``"whole run"``
+    :param joints: names of the columns
+    :param rmse: root mean squared error of each, rad or m, (m,)
+    :param low: 2.5 % quantile over resampled blocks, (m,)
+    :param high: 97.5 % quantile, (m,)
+    :param mae: mean absolute error, (m,)
+    :param windows: number of predictions
+    """
+
+    horizon: float | str
+    joints: tuple[str, ...]
+    rmse: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    mae: np.ndarray
+    windows: int
+
+
+def horizon_errors(
+    simulation: Simulation, values: np.ndarray, data: Measurements, sigma: np.ndarray, seed: int
+) -> list[HorizonError]:
+    """Predict from smoothed measured states under the recorded commands.
+
+    :param simulation: with the effects
+    :param values: their parameters, (p,)
+    :param data: recordings that nothing was fitted to
+    :param sigma: noise of the position columns, (m,)
+    :return: one entry for each horizon that the data are long enough for, and one for whole runs
+    """
+    found = []
+    for horizon in HORIZONS:
+        try:
+            windows = cut(simulation.model, data, sigma, horizon, MOST)
+        except ValueError:
+            continue
+        _, difference, usable = predictions(simulation, values, windows)
+        found.append(_pool(difference, usable, windows, _observed(data), horizon, seed))
+    whole = whole_runs(simulation, values, data, sigma)
+    if whole is not None:
+        found.append(whole)
+    return found
+
+
+def _pool(
+    difference: np.ndarray, usable: np.ndarray, windows: Windows, joints: tuple[str, ...], horizon: float, seed: int
+) -> HorizonError:
+    """Pool the differences of all windows; intervals by resampling blocks."""
+    squares = np.where(usable[:, :, None], difference**2, 0).sum(1)
+    absolute = np.where(usable[:, :, None], np.abs(difference), 0).sum(1)
+    counts = usable.sum(1)[:, None]
+    blocks = [np.flatnonzero(windows.block == b) for b in np.unique(windows.block)]
+    rng = np.random.default_rng(seed)
+    resampled = []
+    for _ in range(RESAMPLES):
+        rows = np.concatenate([blocks[i] for i in rng.integers(len(blocks), size=len(blocks))])
+        resampled.append(np.sqrt(squares[rows].sum(0) / counts[rows].sum(0)))
+    low, high = np.quantile(resampled, [0.025, 0.975], axis=0)
+    rmse, mae = np.sqrt(squares.sum(0) / counts.sum(0)), absolute.sum(0) / counts.sum(0)
+    return HorizonError(horizon, joints, rmse, low, high, mae, len(windows))
+
+
+def predictions(
+    simulation: Simulation, values: np.ndarray, windows: Windows
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Predicted positions, predicted minus measured (both (W, S, m)), and what counts, (W, S).
+
+    A prediction that became unstable stays where the measured values end, as far off as anything measured.
+    """
+    problem = Problem(simulation, windows, [Scales()] * len(simulation.effects))
+    count = len(windows)
+    starts = np.zeros((count, windows.spread.shape[1]))
+    q = problem.predict(np.tile(values, (count, 1)), starts, np.arange(count))
+    away = np.abs(windows.measured).max(axis=(0, 1)) + 10.0
+    q = np.where(np.isfinite(q), q, windows.measured + away)
+    return q, q - windows.measured, windows.usable
+
+
+def whole_runs(
+    simulation: Simulation, values: np.ndarray, data: Measurements, sigma: np.ndarray
+) -> HorizonError | None:
+    """Predict each episode from its first usable state to its end."""
+    differences = []
+    for e in data.episodes:
+        one = replace(data, episodes=[e])
+        start = 0 if data.exact else 12
+        length = float(e.time[-1] - e.time[min(start, len(e) - 2)]) * 0.999
+        try:
+            windows = cut(simulation.model, one, sigma, length, 1)
+        except ValueError:
+            continue
+        _, d, usable = predictions(simulation, values, windows)
+        differences.append(d[0][usable[0]])
+    if not differences:
+        return None
+    rmses = np.array([np.sqrt(np.mean(d**2, axis=0)) for d in differences])
+    pooled = np.concatenate(differences)
+    # Runs are few: their own range stands for the interval.
+    return HorizonError(
+        "whole run",
+        _observed(data),
+        np.sqrt(np.mean(pooled**2, axis=0)),
+        rmses.min(0),
+        rmses.max(0),
+        np.mean(np.abs(pooled), axis=0),
+        len(differences),
+    )
+
+
+def noise_floor(
+    simulation: Simulation, values: np.ndarray, data: Measurements, sigma: np.ndarray, seed: int
+) -> list[HorizonError]:
+    """The errors that a true model would have: those of the measured positions and of the smoothed starts.
+
+    Each window is predicted twice, from its start and from one that errs as smoothing noise lets it err.
+
+    :return: as :func:`horizon_errors`, whole runs left out; empty for exact data
+    """
+    if data.exact:
+        return []
+    rng = np.random.default_rng(seed)
+    found = []
+    for horizon in HORIZONS:
+        try:
+            windows = cut(simulation.model, data, sigma, horizon, MOST)
+        except ValueError:
+            continue
+        problem = Problem(simulation, windows, [Scales()] * len(simulation.effects))
+        count, all_values = len(windows), np.tile(values, (len(windows), 1))
+        draws = rng.standard_normal(windows.spread.shape) / TRUST
+        true = problem.predict(all_values, np.zeros_like(draws), np.arange(count))
+        off = problem.predict(all_values, draws, np.arange(count))
+        noise = rng.standard_normal(true.shape) * windows.sigma
+        usable = windows.usable & np.isfinite(true).all(-1) & np.isfinite(off).all(-1)
+        found.append(_pool(off - true + noise, usable, windows, _observed(data), horizon, seed))
+    return found
+
+
+def _observed(data: Measurements) -> tuple[str, ...]:
+    return tuple(name for name in data.columns.qpos if name not in data.unobserved)

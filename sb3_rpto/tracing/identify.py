@@ -1,0 +1,371 @@
+"""Fitting the parameters of a simulation to windows of recordings (multiple shooting)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sb3_rpto.effects import Scales, Simulation
+from sb3_rpto.effects.effect import Effect
+from sb3_rpto.tracing.windows import Windows
+
+#: Where a simulation became unstable, its residual in units of the noise.
+UNSTABLE = 1e4
+#: The smoothed start of a window may err by so many times its computed spread: motion is not a cubic.
+TRUST = 3.0
+#: Weak pull of an effect's parameters towards their null values, in plausible sizes.
+RIDGE = 30.0
+#: Finite differences, in plausible sizes: at a null value they are as wide as the effect must be to show.
+WIDE, NARROW = 1.0, 0.05
+#: Most simulations in one batch.
+CHUNK = 6000
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters fitted to windows.
+
+    :param values: all parameters of the simulation, (p,)
+    :param starts: corrections of the windows' starts, in units of their spread, (W, 2 nv)
+    :param errors: root mean squared residual of each window in units of the noise, (W,)
+    :param cost: robust cost
+    """
+
+    values: np.ndarray
+    starts: np.ndarray
+    errors: np.ndarray
+    cost: float
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The cost around a fit, each window's start eliminated, in coordinates of plausible sizes.
+
+    :param normal: (W, f, f) Gauss-Newton matrices of the free parameters
+    :param gradient: (W, f)
+    :param free: indices of the free parameters, (f,)
+    """
+
+    normal: np.ndarray
+    gradient: np.ndarray
+    free: np.ndarray
+
+
+class Problem:
+    """Windows, and the simulation that is to predict them.
+
+    Unknown are the simulation's parameters, common to all windows, and each window's start, near its smoothed state.
+    The residual is (predicted - measured) / noise, and the corrections of the start in units of their trusted spread.
+
+    :param simulation: with all effects that may be free
+    :param windows: recordings
+    :param scales: what is large at each effect's place, in the order of the effects
+    """
+
+    def __init__(self, simulation: Simulation, windows: Windows, scales: Sequence[Scales]) -> None:
+        self.simulation, self.windows = simulation, windows
+        parameters = [(p, s) for e, s in zip(simulation.effects, scales) for p in e.parameters]
+        self.size = np.array([p.size_for(s) for p, s in parameters])
+        self.lower = np.array([p.lower for p, _ in parameters])
+        self.upper = np.array([p.upper for p, _ in parameters])
+        self.null = simulation.null
+        self.declared = np.array([e.kind == "declared" for e in simulation.effects for _ in e.parameters], dtype=bool)
+        self.moving = np.flatnonzero((windows.spread > 0).any(axis=0))  # coordinates of the start that are free
+        self.sensors = [
+            (e, s) for e, s in zip(simulation.effects, simulation.slices) if e.overrides("observe")
+        ]
+
+    # --- prediction ---------------------------------------------------------------------------------------------
+
+    def predict(self, values: np.ndarray, starts: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """What the sensors should have shown.
+
+        :param values: (n, p)
+        :param starts: corrections of the start, (n, 2 nv)
+        :param index: window of each of the n simulations, (n,)
+        :return: (n, S, m), NaN where unstable
+        """
+        parts = np.array_split(np.arange(len(index)), -(-len(index) // CHUNK))
+        return np.concatenate([self._predict(values[i], starts[i], index[i]) for i in parts])
+
+    def _predict(self, values: np.ndarray, starts: np.ndarray, index: np.ndarray) -> np.ndarray:
+        w, model = self.windows, self.simulation.model
+        shift = starts * w.spread[index] * TRUST
+        qpos, qvel = w.qpos[index].copy(), w.qvel[index] + shift[:, model.nv :]
+        for joint in range(model.njnt):
+            # Only scalar joints have a spread, see start_state.
+            qpos[:, model.jnt_qposadr[joint]] += shift[:, model.jnt_dofadr[joint]]
+        for effect, s in self.sensors:
+            qpos[:, effect.adr], qvel[:, effect.dof] = effect.unobserve(
+                qpos[:, effect.adr], qvel[:, effect.dof], values[:, s]
+            )
+        q, v = self.simulation.rollout(values, qpos, qvel, w.drive.take(index))
+        out = interpolate(q, v, w.at[index], float(model.opt.timestep), w.columns, self._dofs())
+        for effect, s in self.sensors:
+            for column in np.flatnonzero(w.columns == effect.adr):
+                out[:, :, column] = effect.observe(out[:, :, column], out[:, :, column], values[:, None, s])[0]
+        return out
+
+    def _dofs(self) -> np.ndarray:
+        """Address in qvel of each observed column, -1 for a coordinate without a velocity of its own."""
+        model = self.simulation.model
+        dof_of = {int(model.jnt_qposadr[j]): int(model.jnt_dofadr[j]) for j in range(model.njnt) if model.jnt_type[j] > 1}
+        return np.array([dof_of.get(int(c), -1) for c in self.windows.columns])
+
+    def residuals(self, values: np.ndarray, starts: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Residuals in units of the noise, (n, S m); zero for samples that do not count."""
+        w = self.windows
+        r = (self.predict(values, starts, index) - w.measured[index]) / w.sigma
+        r = np.clip(np.nan_to_num(r, nan=UNSTABLE), -UNSTABLE, UNSTABLE)
+        return (r * w.usable[index][:, :, None]).reshape(len(index), -1)
+
+    def errors(self, residuals: np.ndarray) -> np.ndarray:
+        """Root mean squared residual of each window, (W,), from (W, S m)."""
+        counts = self.windows.usable.sum(axis=1) * self.windows.measured.shape[2]
+        return np.sqrt((residuals**2).sum(axis=1) / counts)
+
+    # --- derivatives --------------------------------------------------------------------------------------------
+
+    def steps(self, values: np.ndarray) -> np.ndarray:
+        """Finite-difference steps of all parameters in their units, (p,), pointing inside the bounds."""
+        at_null = np.isclose(values, self.null, rtol=0, atol=1e-9 * self.size) & ~self.declared
+        step = np.where(at_null, WIDE, NARROW) * self.size
+        return np.where(values + step > self.upper, -step, step)
+
+    def linearise(
+        self, values: np.ndarray, starts: np.ndarray, free: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals and their derivatives by the free parameters (in plausible sizes) and by the start.
+
+        :param values: (p,)
+        :param starts: (W, 2 nv)
+        :param free: (f,) indices
+        :return: (W, R), (W, R, f), (W, R, x)
+        """
+        count, f, x = len(self.windows), len(free), len(self.moving)
+        columns = 1 + f + x
+        all_values = np.tile(values, (columns, count, 1))
+        all_starts = np.tile(starts, (columns, 1, 1))
+        step = self.steps(values)[free]
+        for i, parameter in enumerate(free):
+            all_values[1 + i, :, parameter] += step[i]
+        for i, coordinate in enumerate(self.moving):
+            all_starts[1 + f + i, :, coordinate] += 0.3
+        index = np.tile(np.arange(count), columns)
+        r = self.residuals(all_values.reshape(-1, len(values)), all_starts.reshape(columns * count, -1), index)
+        r = r.reshape(columns, count, -1)
+        by_values = (r[1 : 1 + f] - r[0]) * (self.size[free] / step)[:, None, None]
+        by_start = (r[1 + f :] - r[0]) / 0.3
+        # A difference across a simulation that blew up says nothing.
+        by_values, by_start = (np.where(np.abs(d) < 0.5 * UNSTABLE, d, 0.0) for d in (by_values, by_start))
+        return r[0], by_values.transpose(1, 2, 0), by_start.transpose(1, 2, 0)
+
+    # --- fits ---------------------------------------------------------------------------------------------------
+
+    def reduce(self, r: np.ndarray, jt: np.ndarray, jx: np.ndarray, starts: np.ndarray, clip: float) -> _Reduced:
+        """Weighted normal equations of each window with its start eliminated (Schur complement)."""
+        weight = 1 / np.sqrt(1 + (r / clip) ** 2)  # soft-L1, as iterated least squares
+        wt = jt * weight[:, :, None]
+        htt, gt = np.einsum("wrf,wrg->wfg", wt, jt), np.einsum("wrf,wr->wf", wt, r)
+        if not jx.shape[2]:
+            return _Reduced(htt, gt, np.zeros((len(r), 0, jt.shape[2])), np.zeros((len(r), 0)))
+        wx = jx * weight[:, :, None]
+        hxx = np.einsum("wrx,wry->wxy", wx, jx) + np.eye(jx.shape[2])
+        hxt, gx = np.einsum("wrx,wrf->wxf", wx, jt), np.einsum("wrx,wr->wx", wx, r) + starts[:, self.moving]
+        gain, move = np.linalg.solve(hxx, hxt), np.linalg.solve(hxx, gx[:, :, None])[:, :, 0]
+        normal = htt - np.einsum("wxf,wxg->wfg", hxt, gain)
+        gradient = gt - np.einsum("wxf,wx->wf", hxt, move)
+        return _Reduced(normal, gradient, gain, move)
+
+    def cost(self, r: np.ndarray, starts: np.ndarray, values: np.ndarray, clip: float) -> np.ndarray:
+        """Robust cost of one or more candidates: r (..., W, R), starts (..., W, 2 nv), values (..., p)."""
+        soft = 2 * clip**2 * (np.sqrt(1 + (r / clip) ** 2) - 1)
+        pull = np.where(self.declared, 0.0, (values - self.null) / self.size / RIDGE) ** 2
+        return soft.sum((-1, -2)) + (starts**2).sum((-1, -2)) + pull.sum(-1)
+
+    def fit(
+        self,
+        values: np.ndarray,
+        free: np.ndarray,
+        starts: np.ndarray | None = None,
+        iterations: int = 12,
+        tolerance: float = 1e-3,
+    ) -> Fit:
+        """Levenberg-Marquardt on the free parameters and all starts, within the bounds.
+
+        :param values: where it begins, (p,); the others stay
+        :param free: indices, (f,)
+        :param starts: as in :class:`Fit`; default: the smoothed states
+        :param iterations: most steps
+        :param tolerance: stop when the cost falls by less than this share
+        :return: never worse than where it began
+        """
+        values, damping = values.copy(), 1e-3
+        starts = np.zeros((len(self.windows), 2 * self.simulation.model.nv)) if starts is None else starts.copy()
+        count = len(self.windows)
+        r = np.zeros(0)
+        small = 0
+        for _ in range(iterations):
+            r, jt, jx = self.linearise(values, starts, free)
+            clip = 3 * max(1.0, 1.4826 * float(np.median(np.abs(r))))
+            now = float(self.cost(r, starts, values, clip))
+            reduced = self.reduce(r, jt, jx, starts, clip)
+            tries = damping * np.array([0.1, 1.0, 10.0, 100.0]) if len(free) else np.array([damping])
+            steps = [self._step(values, free, reduced, d) for d in tries]
+            trial_values = np.stack([values + s for s in steps])
+            trial_starts = np.repeat(starts[None], len(tries), 0)
+            for t, s in enumerate(steps):
+                trial_starts[t][:, self.moving] -= reduced.move + reduced.gain @ (s[free] / self.size[free])
+            trial_starts = np.clip(trial_starts, -10, 10)
+            index = np.tile(np.arange(count), len(tries))
+            trial_r = self.residuals(
+                np.repeat(trial_values, count, 0), trial_starts.reshape(len(tries) * count, -1), index
+            ).reshape(len(tries), count, -1)
+            costs = self.cost(trial_r, trial_starts, trial_values, clip)
+            best = int(np.argmin(costs))
+            if not costs[best] < now:
+                damping *= 1000
+                if damping > 1e8:
+                    break
+                continue
+            values, starts, r = trial_values[best], trial_starts[best], trial_r[best]
+            damping = max(1e-6, float(tries[best]))
+            small = small + 1 if now - costs[best] < tolerance * now else 0
+            if small:
+                break
+        clip = 3 * max(1.0, 1.4826 * float(np.median(np.abs(r))))
+        return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, clip)))
+
+    def _step(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced, damping: float) -> np.ndarray:
+        """A damped Gauss-Newton step within the bounds, (p,); what would leave them is held there."""
+        step = np.zeros(len(values))
+        if not len(free):
+            return step
+        normal, gradient = reduced.normal.sum(0), reduced.gradient.sum(0)
+        pull = np.where(self.declared[free], 0.0, 1 / RIDGE**2)
+        z = (values[free] - self.null[free]) / self.size[free]
+        gradient = gradient + pull * z
+        normal = normal + np.diag(pull + damping * (np.diag(normal) + 1e-3 * np.diag(normal).max() + 1e-12))
+        low, high = ((b[free] - values[free]) / self.size[free] for b in (self.lower, self.upper))
+        step[free] = bounded_step(normal, gradient, low, high) * self.size[free]
+        return np.clip(values + step, self.lower, self.upper) - values
+
+    def linear(self, fit: Fit, free: np.ndarray) -> Linear:
+        """The reduced normal equations at a fit, for screening, elimination and intervals."""
+        r, jt, jx = self.linearise(fit.values, fit.starts, free)
+        clip = 3 * max(1.0, 1.4826 * float(np.median(np.abs(r))))
+        reduced = self.reduce(r, jt, jx, fit.starts, clip)
+        return Linear(reduced.normal, reduced.gradient, free)
+
+    def score(self, values: np.ndarray, iterations: int = 2) -> Fit:
+        """Errors of the windows with the parameters given, (p,), and their starts fitted."""
+        return self.fit(values, np.empty(0, dtype=int), iterations=iterations, tolerance=1e-2)
+
+    def noise_errors(self, fit: Fit, seed: int, draws: int = 8) -> np.ndarray:
+        """Errors that a true model would have: white noise, less what the fitted starts take of it, (draws, W)."""
+        _, _, jx = self.linearise(fit.values, fit.starts, np.empty(0, dtype=int))
+        w = self.windows
+        rng = np.random.default_rng(seed)
+        mask = np.repeat(w.usable, w.measured.shape[2], axis=1)
+        out = []
+        for _ in range(draws):
+            r = rng.standard_normal(mask.shape) * mask
+            if jx.shape[2]:
+                hxx = np.einsum("wrx,wry->wxy", jx, jx) + np.eye(jx.shape[2])
+                move = np.linalg.solve(hxx, np.einsum("wrx,wr->wx", jx, r)[:, :, None])[:, :, 0]
+                r = r - np.einsum("wrx,wx->wr", jx, move)
+            out.append(self.errors(r))
+        return np.array(out)
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    normal: np.ndarray  # (W, f, f)
+    gradient: np.ndarray  # (W, f)
+    gain: np.ndarray  # (W, x, f), how the starts follow the parameters
+    move: np.ndarray  # (W, x), how the starts move by themselves
+
+
+def bounded_step(normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Minimise the quadratic within a box by holding what leaves it; exact for a diagonal matrix."""
+    held = np.zeros(len(gradient), dtype=bool)
+    step = np.zeros(len(gradient))
+    for _ in range(len(gradient) + 1):
+        go = ~held
+        if not go.any():
+            break
+        rhs = -(gradient[go] + normal[np.ix_(go, held)] @ step[held])
+        step[go] = np.linalg.lstsq(normal[np.ix_(go, go)], rhs, rcond=1e-12)[0]
+        out = go & ((step < low) | (step > high))
+        if not out.any():
+            break
+        step[out] = np.clip(step[out], low[out], high[out])
+        held |= out
+    return step
+
+
+def interpolate(
+    q: np.ndarray, v: np.ndarray, at: np.ndarray, dt: float, columns: np.ndarray, dofs: np.ndarray
+) -> np.ndarray:
+    """Positions at fractional steps by cubic Hermite interpolation, (n, S, m).
+
+    :param q: (n, K + 1, nq)
+    :param v: (n, K + 1, nv)
+    :param at: (n, S)
+    :param dt: length of a step in s
+    :param columns: addresses in q, (m,)
+    :param dofs: addresses in v, -1 for a coordinate that is interpolated linearly, (m,)
+    """
+    k = np.minimum(at.astype(int), q.shape[1] - 2)
+    s = (at - k)[:, :, None]
+    rows = np.arange(len(q))[:, None]
+    q0, q1 = q[rows, k][:, :, columns], q[rows, k + 1][:, :, columns]
+    if not np.any(s % 1):
+        return np.where(s == 0, q0, q1)
+    slope = q1 - q0
+    d0 = np.where(dofs >= 0, dt * v[rows, k][:, :, dofs], slope)
+    d1 = np.where(dofs >= 0, dt * v[rows, k + 1][:, :, dofs], slope)
+    return q0 + s * (d0 + s * ((3 * slope - 2 * d0 - d1) + s * (d0 + d1 - 2 * slope)))
+
+
+def scales_for(effects: Sequence[Effect], typical: Typical) -> list[Scales]:
+    """What is large at the place of each bound effect."""
+    return [typical.at(e) for e in effects]
+
+
+@dataclass(frozen=True)
+class Typical:
+    """Typical magnitudes in the data, joint by joint and actuator by actuator.
+
+    :param torque: peak generalised force, (nv,)
+    :param velocity: peak speed, (nv,)
+    :param inertia: diagonal of the mass matrix, (nv,)
+    :param span: range of positions, (nv,)
+    :param command: peak command, (nu,)
+    :param mass: of each body, (nbody,)
+    """
+
+    torque: np.ndarray
+    velocity: np.ndarray
+    inertia: np.ndarray
+    span: np.ndarray
+    command: np.ndarray
+    mass: np.ndarray
+
+    def at(self, effect: Effect) -> Scales:
+        """The scales where a bound effect sits."""
+        total = float(self.mass.sum())
+        rest = Scales(
+            *(float(getattr(self, n).max(initial=1e-9)) for n in ("torque", "velocity", "command", "inertia", "span")),
+            total,
+        )
+        if effect.place in ("joint", "sensor"):
+            at = {n: float(getattr(self, n)[effect.dof]) for n in ("torque", "velocity", "inertia", "span")}
+            return replace(rest, **at)
+        if effect.place == "actuator":
+            return replace(rest, command=float(self.command[effect.index]))
+        if effect.place == "body":
+            return replace(rest, mass=float(self.mass[effect.index]))
+        return rest

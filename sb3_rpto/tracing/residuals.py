@@ -1,0 +1,189 @@
+"""The generalised force that a model lacks, by inverse dynamics: for plots, scales and screening, never for decisions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from scipy.signal import butter, filtfilt
+
+from sb3_rpto.effects import Simulation
+from sb3_rpto.effects.simulation import filter_commands, names_of, prepare
+from sb3_rpto.effects.world import BatchWorld
+from sb3_rpto.tracing.episodes import Episode
+from sb3_rpto.tracing.identify import Typical
+from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.windows import command_order, scalar_joints
+
+#: Cut-off of the zero-phase low pass in Hz; lower where the sampling asks for it.
+CUTOFF = 15.0
+#: Speeds below this share of the typical one count as rest, where dry friction has no known sign.
+REST = 0.05
+
+
+@dataclass(frozen=True)
+class ForceResidual:
+    """What inverse dynamics lacks in one episode, all filtered in the same way.
+
+    :param episode: its name
+    :param time: uniform times in s, (T,)
+    :param qpos: rad or m, (T, nv), of scalar joints (others are zero)
+    :param qvel: rad/s or m/s, (T, nv)
+    :param load: generalised force of the actuators as the model has it, N·m or N, (T, nv)
+    :param command: (T, nu)
+    :param force: needed by the motion less what the model has, N·m or N, (T, nv)
+    """
+
+    episode: str
+    time: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    load: np.ndarray
+    command: np.ndarray
+    force: np.ndarray
+
+
+def force_residuals(simulation: Simulation, values: np.ndarray, data: Measurements) -> list[ForceResidual]:
+    """Inverse dynamics of every episode: the force that the motion needed and the model does not know.
+
+    :param simulation: the model with its effects
+    :param values: their parameters, (p,)
+    :param data: recordings
+    """
+    return [_residual(simulation, values, data, e) for e in data.episodes if len(e) > 30]
+
+
+def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e: Episode) -> ForceResidual:
+    nominal = simulation.model
+    h = float(np.median(np.diff(e.time)))
+    time = np.arange(e.time[0], e.time[-1], h)
+    addresses = names_of(nominal, data.columns.qpos)
+    scalar = {int(nominal.jnt_qposadr[j]): int(nominal.jnt_dofadr[j]) for j in scalar_joints(nominal)}
+    qpos = np.tile(nominal.qpos0, (len(time), 1))
+    qvel, qacc = np.zeros((len(time), nominal.nv)), np.zeros((len(time), nominal.nv))
+    shown = np.zeros((len(time), nominal.nv))
+    low = _low_pass(h, len(time))
+    for column, address in enumerate(addresses):
+        path = low(np.interp(time, e.time, e.qpos[:, column]))
+        qpos[:, address] = path
+        if int(address) in scalar:
+            dof = scalar[int(address)]
+            shown[:, dof] = path
+            qvel[:, dof] = np.gradient(path, h)
+            qacc[:, dof] = np.gradient(qvel[:, dof], h)
+    row = np.clip(np.searchsorted(e.time, time + 1e-9, side="right") - 1, 0, len(e) - 1)
+    commands = np.zeros((1, len(time), nominal.nu))
+    commands[0][:, command_order(nominal, data)] = e.ctrl[row] * e.enabled[row]
+    active = [
+        (effect, values[None, s])
+        for effect, s in zip(simulation.effects, simulation.slices)
+        if effect.kind == "declared" or np.any((values[s] != simulation.null[s])[simulation.strength[s]])
+    ]
+    commands = filter_commands(active, commands, h)[0]
+    world = BatchWorld(nominal, 1, 1)
+    for name, value in e.params.items():
+        simulation._setting(name).write(world, np.array([[value]]))
+    prepare(world, active)
+    model = world.batch.get_model(0)
+    friction = model.dof_frictionloss.copy()
+    # Dry friction as a constraint answers to every ripple of a differentiated position: its level is taken below.
+    model.dof_frictionloss[:] = 0
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+    mj = mujoco.MjData(model)
+    needed, load = np.zeros_like(qvel), np.zeros_like(qvel)
+    extra = np.zeros_like(qvel)
+    acting = [(effect, x) for effect, x in active if effect.overrides("act")]
+    for t in range(len(time)):
+        mj.qpos[:], mj.qvel[:], mj.ctrl[:] = qpos[t], qvel[t], commands[t]
+        mujoco.mj_forward(model, mj)
+        load[t] = mj.qfrc_actuator
+        mj.qacc[:] = qacc[t]
+        mujoco.mj_inverse(model, mj)
+        needed[t] = mj.qfrc_inverse
+        level = friction.copy()
+        if acting:
+            world.qpos[:], world.qvel[:] = qpos[t], qvel[t]
+            world.ctrl[:] = commands[t]
+            world.batch.forward()
+            world.force[:] = 0
+            world.friction[:] = 0
+            for effect, x in acting:
+                effect.act(world, x)
+            extra[t] = world.force[0]
+            level = level + world.friction[0]
+        extra[t] -= level * np.sign(qvel[t])
+    load = np.stack([low(column) for column in load.T], axis=1)
+    extra = np.stack([low(column) for column in extra.T], axis=1)
+    return ForceResidual(e.name, time - time[0], shown, qvel, load, commands, needed - load - extra)
+
+
+def _low_pass(h: float, length: int):  # type: ignore[no-untyped-def]
+    cutoff = min(CUTOFF, 0.2 / h)
+    b, a = butter(2, 2 * cutoff * h)
+    pad = min(length - 1, 60)
+    return lambda signal: filtfilt(b, a, signal, padlen=pad)
+
+
+def typical(simulation: Simulation, residuals: list[ForceResidual]) -> Typical:
+    """Typical magnitudes, from the residuals of the nominal model (its own load and what it lacks)."""
+    model = simulation.model
+    mj = mujoco.MjData(model)
+    mujoco.mj_forward(model, mj)
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, mj, full)
+    rows = {n: np.concatenate([getattr(r, n) for r in residuals]) for n in ("qpos", "qvel", "load", "force", "command")}
+
+    def high(values: np.ndarray) -> np.ndarray:
+        return np.maximum(np.quantile(np.abs(values), 0.95, axis=0), 1e-9)
+
+    return Typical(
+        torque=high(rows["load"] + rows["force"]),
+        velocity=high(rows["qvel"]),
+        inertia=np.maximum(np.diag(full), 1e-9),
+        span=np.maximum(np.ptp(rows["qpos"], axis=0), 1e-3),
+        command=high(rows["command"]),
+        mass=np.maximum(model.body_mass, 1e-9),
+    )
+
+
+def summary(residuals: list[ForceResidual]) -> np.ndarray:
+    """Root mean squared force residual of each degree of freedom away from rest, (nv,)."""
+    force = np.concatenate([r.force for r in residuals])
+    speed = np.abs(np.concatenate([r.qvel for r in residuals]))
+    moving = speed > REST * np.quantile(speed, 0.95, axis=0)
+    return np.array([np.sqrt(np.mean(f[m] ** 2)) if m.any() else 0.0 for f, m in zip(force.T, moving.T)])
+
+
+def learnable_share(residuals: list[ForceResidual], seed: int, features: int = 200) -> np.ndarray:
+    """Share of the force residual's variance that a small regressor predicts on unseen stretches, (nv,).
+
+    Ridge regression on random tanh features of position, velocity, load and their recent past: the upper bound of
+    what a learned correction could still add. Zero when it predicts nothing.
+
+    :param residuals: of all episodes
+    :param seed: of the features
+    :param features: number of them
+    """
+    rng = np.random.default_rng(seed)
+    inputs, targets, fold = [], [], []
+    for number, r in enumerate(residuals):
+        lag = max(1, round(0.02 / max(float(np.median(np.diff(r.time))), 1e-6)))
+        now = np.concatenate([np.sin(r.qpos), np.cos(r.qpos), r.qvel, np.sign(r.qvel), r.load], axis=1)
+        inputs.append(np.concatenate([now, np.roll(np.concatenate([r.qvel, r.load], 1), lag, axis=0)], axis=1)[lag:])
+        targets.append(r.force[lag:])
+        half = np.arange(len(r.force) - lag) * 8 // max(1, len(r.force) - lag)
+        fold.append((half + number) % 2)
+    x, y, part = np.concatenate(inputs), np.concatenate(targets), np.concatenate(fold)
+    x = (x - x.mean(0)) / (x.std(0) + 1e-9)
+    hidden = np.tanh(x @ rng.standard_normal((x.shape[1], features)) / np.sqrt(x.shape[1]) + rng.uniform(-1, 1, features))
+    design = np.concatenate([np.ones((len(x), 1)), x, hidden], axis=1)
+    left = np.zeros_like(y)
+    for held in (0, 1):
+        a, b = part != held, part == held
+        normal = design[a].T @ design[a] + 1e-2 * a.sum() * np.eye(design.shape[1]) / 10
+        weights = np.linalg.solve(normal, design[a].T @ (y[a] - y[a].mean(0)))
+        left[b] = y[b] - y[a].mean(0) - design[b] @ weights
+    total = np.sum((y - y.mean(0)) ** 2, axis=0)
+    share = 1 - np.sum(left**2, axis=0) / np.maximum(total, 1e-12)
+    return np.clip(share, 0.0, 1.0)

@@ -1,0 +1,257 @@
+"""Which effects are needed: a joint fit of all candidates, and elimination backwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sb3_rpto.tracing.identify import Fit, Problem
+from sb3_rpto.tracing.screen import Screening
+
+#: Effects must lower the typical window error by this share to stay.
+GAIN = 0.03
+#: Iterations of a refit that begins at the larger model's optimum.
+REFIT = 5
+#: Candidates for a substitution are the likest so many.
+SUBSTITUTES = 5
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a model gains over another on the select windows.
+
+    :param gain: share of the typical window error saved, 1 - exp(-mean log ratio)
+    :param t: mean log error ratio of the blocks over its standard error
+    :param blocks: the log ratio of each block, (b,)
+    """
+
+    gain: float
+    t: float
+    blocks: np.ndarray
+
+    def clear(self, threshold: float) -> bool:
+        """Whether the gain is more than chance and more than a trifle."""
+        return self.t > threshold and self.gain > GAIN
+
+    def frequency(self, threshold: float, rng: np.random.Generator, resamples: int = 200) -> float:
+        """Share of resampled sets of blocks in which the gain is clear."""
+        n = len(self.blocks)
+        found = [_evidence(self.blocks[rng.integers(n, size=n)]).clear(threshold) for _ in range(resamples)]
+        return float(np.mean(found))
+
+
+def compare(without: np.ndarray, with_: np.ndarray, blocks: np.ndarray) -> Evidence:
+    """Evidence for the model with an effect against the one without.
+
+    :param without: errors of the windows, (W,)
+    :param with_: errors of the same windows, (W,)
+    :param blocks: number of the block of each window, (W,)
+    """
+    ratio = np.log(np.maximum(without, 1e-12)) - np.log(np.maximum(with_, 1e-12))
+    return _evidence(np.array([ratio[blocks == b].mean() for b in np.unique(blocks)]))
+
+
+def _evidence(blocks: np.ndarray) -> Evidence:
+    mean = float(blocks.mean())
+    if len(blocks) < 2:
+        return Evidence(1 - float(np.exp(-mean)), 0.0, blocks)
+    error = float(blocks.std(ddof=1)) / np.sqrt(len(blocks))
+    # Few blocks may agree by chance: their spread counts as at least a percent.
+    error = max(error, 0.01 / np.sqrt(len(blocks)))
+    return Evidence(1 - float(np.exp(-mean)), mean / error, blocks)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A set of effects with its fit and its errors on the select windows.
+
+    :param effects: indices in the simulation, declared ones not among them
+    """
+
+    effects: tuple[int, ...]
+    fit: Fit
+    errors: np.ndarray
+
+
+@dataclass
+class Selection:
+    """The outcome of the elimination.
+
+    :param model: what is kept
+    :param evidence: for each kept effect, by index
+    :param alike: effects that could stand for a kept one, by index
+    :param dropped: the step, gain and t at which an effect was dropped, by index
+    """
+
+    model: Model
+    evidence: dict[int, Evidence] = field(default_factory=dict)
+    alike: dict[int, list[int]] = field(default_factory=dict)
+    dropped: dict[int, tuple[int, Evidence | None]] = field(default_factory=dict)
+
+
+class Selector:
+    """Fits and compares models on training and select windows.
+
+    :param train: windows to fit
+    :param select: windows to judge on
+    :param threshold: t*, see :func:`sb3_rpto.tracing.trace.trace`
+    :param say: progress
+    """
+
+    def __init__(self, train: Problem, select: Problem, threshold: float, say: Say) -> None:
+        self.train, self.select, self.threshold, self.say = train, select, threshold, say
+        self.simulation = train.simulation
+        self._memory: dict[tuple[int, ...], Model] = {}
+
+    def free(self, effects: Sequence[int]) -> np.ndarray:
+        """Indices of the parameters of the declared and of the given effects."""
+        keep = [s for i, s in enumerate(self.simulation.slices) if i in effects or self.simulation.effects[i].kind == "declared"]
+        return np.concatenate([np.arange(s.start, s.stop) for s in keep]).astype(int) if keep else np.empty(0, dtype=int)
+
+    def model(self, effects: Sequence[int], begin: Fit, iterations: int = REFIT) -> Model:
+        """Fit a model from the optimum of another, without the effects that it lacks."""
+        key = tuple(sorted(effects))
+        if key in self._memory:
+            return self._memory[key]
+        values = begin.values.copy()
+        for i, s in enumerate(self.simulation.slices):
+            if i not in key and self.simulation.effects[i].kind != "declared":
+                values[s] = self.simulation.null[s]
+        fit = self.train.fit(values, self.free(key), begin.starts, iterations)
+        found = Model(key, fit, self.select.score(fit.values).errors)
+        self._memory[key] = found
+        return found
+
+    def evidence(self, with_: Model, without: Model) -> Evidence:
+        """What ``with_`` gains over ``without`` on the select windows."""
+        return compare(without.errors, with_.errors, self.select.windows.block)
+
+    def eliminate(self, full: Model, base: Model) -> Selection:
+        """Drop the effect whose removal costs least until all that remain are needed.
+
+        :param full: all candidates
+        :param base: the declared parameters alone
+        """
+        current, step = full, 0
+        outcome = Selection(full)
+        while current.effects:
+            step += 1
+            order, costs = self.removal_costs(current)
+            trifles = [e for e in order if costs[e] < 0.002 * current.fit.cost]
+            reduced = None
+            for drop in _bundles(order, trifles):
+                trial = self.model([e for e in current.effects if e not in drop], current.fit)
+                evidence = self.evidence(current, trial)
+                self.say(f"{len(trial.effects)} effects left")
+                if not evidence.clear(self.threshold):
+                    reduced = trial
+                    for e in drop:
+                        outcome.dropped[e] = (step, evidence if len(drop) == 1 else None)
+                    break
+            if reduced is None:
+                break
+            current = reduced
+        outcome.model = current
+        return outcome
+
+    def removal_costs(self, model: Model) -> tuple[list[int], dict[int, float]]:
+        """Effects by the rise of the cost that their removal causes, to second order, cheapest first."""
+        free = self.free(model.effects)
+        linear = self.train.linear(model.fit, free)
+        normal = linear.normal.sum(0)
+        normal = normal + 1e-8 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(free))
+        inverse = np.linalg.pinv(normal)
+        costs = {}
+        for e in model.effects:
+            s = self.simulation.slices[e]
+            rows = np.flatnonzero((free >= s.start) & (free < s.stop) & self.simulation.strength[free])
+            z = ((model.fit.values - self.simulation.null) / self.train.size)[free[rows]]
+            costs[e] = float(z @ np.linalg.pinv(inverse[np.ix_(rows, rows)]) @ z)
+        return sorted(costs, key=lambda e: costs[e]), costs
+
+    def substitute(self, selection: Selection, screening: Screening) -> Selection:
+        """Try the likest other effects in the place of each kept one; keep the better, name those that do as well."""
+        current = selection.model
+        for e in current.effects:
+            others = [i for i in np.argsort(-screening.cosine[e]) if i != e and i not in current.effects]
+            others = [int(i) for i in others if screening.excited(int(i)) and screening.cosine[e, i] > 0.3][:SUBSTITUTES]
+            best, alike = e, []
+            for other in others:
+                self.say(f"{self.simulation.effects[e].kind} or {self.simulation.effects[other].kind}")
+                trial = self.model([i for i in current.effects if i != best] + [other], current.fit, REFIT + 3)
+                loses = self.evidence(current, trial)
+                if self.evidence(trial, current).clear(self.threshold):
+                    current, alike, best = trial, [*alike, best], other
+                elif not loses.clear(self.threshold):
+                    alike.append(other)
+                    if self._simpler(other, best):
+                        current, best = trial, other
+            selection.alike[best] = sorted({e, *alike} - {best})
+        selection.model = current
+        selection.alike = {e: [i for i in found if i not in current.effects] for e, found in selection.alike.items() if e in current.effects}
+        return selection
+
+    def _simpler(self, a: int, b: int) -> bool:
+        return len(self.simulation.effects[a].parameters) < len(self.simulation.effects[b].parameters)
+
+    def judge(self, selection: Selection) -> Selection:
+        """Evidence for each kept effect against the model without it; what is not clear goes."""
+        while True:
+            current = selection.model
+            selection.evidence = {}
+            for e in current.effects:
+                without = self.model([i for i in current.effects if i != e], current.fit, REFIT + 3)
+                selection.evidence[e] = self.evidence(current, without)
+            weak = [e for e, evidence in selection.evidence.items() if not evidence.clear(self.threshold)]
+            if not weak:
+                return selection
+            worst = min(weak, key=lambda e: selection.evidence[e].t)
+            selection.dropped[worst] = (0, selection.evidence[worst])
+            selection.model = self.model([i for i in current.effects if i != worst], current.fit)
+
+    def add_back(self, selection: Selection, candidates: Sequence[int]) -> Selection:
+        """One look forward: an effect that the elimination dropped may be needed after all."""
+        current = selection.model
+        outside = [c for c in candidates if c not in current.effects]
+        if not outside:
+            return selection
+        gains = self._promise(current, outside)
+        for e in sorted(outside, key=lambda e: -gains[e])[:3]:
+            trial = self.model([*current.effects, e], current.fit, REFIT + 3)
+            self.say(f"looking at {self.simulation.effects[e].kind} again")
+            if self.evidence(trial, current).clear(self.threshold):
+                current = trial
+                selection.dropped.pop(e, None)
+        selection.model = current
+        return selection
+
+    def _promise(self, model: Model, outside: Sequence[int]) -> dict[int, float]:
+        """How much each effect could lower the cost, to second order."""
+        free = self.free([*model.effects, *outside])
+        free = free[self.simulation.strength[free] | (model.fit.values[free] != self.simulation.null[free])]
+        linear = self.train.linear(model.fit, free)
+        normal, gradient = linear.normal.sum(0), linear.gradient.sum(0)
+        known = np.flatnonzero(~np.isin(free, np.concatenate([np.arange(*_ends(self.simulation.slices[e])) for e in outside])))
+        gains = {}
+        for e in outside:
+            rows = np.flatnonzero(np.isin(free, np.arange(*_ends(self.simulation.slices[e]))))
+            inner = normal[np.ix_(known, known)] + 1e-6 * np.eye(len(known))
+            cross = np.linalg.solve(inner, normal[np.ix_(known, rows)])
+            perp = normal[np.ix_(rows, rows)] - normal[np.ix_(rows, known)] @ cross
+            g = gradient[rows] - cross.T @ gradient[known]
+            gains[e] = float(g @ np.linalg.pinv(perp, rcond=1e-9) @ g)
+        return gains
+
+
+def _ends(s: slice) -> tuple[int, int]:
+    return s.start, s.stop
+
+
+def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:
+    """What to try to drop: all that hardly matter at once, half of them, then the cheapest three one by one."""
+    bundles = [trifles, trifles[: len(trifles) // 2]] if len(trifles) > 1 else []
+    return [b for b in bundles if len(b) > 1] + [[e] for e in order[:3]]

@@ -1,0 +1,357 @@
+"""Close the loop with measured data: find the residual, trace it to an effect the model lacks, add it, report both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from sb3_rpto.effects import LIBRARY, Declared, Effect, Simulation, declare
+from sb3_rpto.effects.library import candidates as all_candidates
+from sb3_rpto.effects.model import load_model
+from sb3_rpto.tracing.adequacy import Adequacy, adequacy
+from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
+from sb3_rpto.tracing.identify import Fit, Problem, scales_for
+from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.model_checks import check_against
+from sb3_rpto.tracing.report import Candidate, Report, Traced
+from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary, typical
+from sb3_rpto.tracing.screen import Screening, screen
+from sb3_rpto.tracing.select import Model, Selection, Selector
+from sb3_rpto.tracing.windows import Windows, cut, noise_levels, time_step
+
+#: The 95 % quantile of the largest t on complete data; see docs/tracing.md for the sets that it comes from.
+THRESHOLD = 3.5
+#: Most windows to fit, and to select on.
+TRAIN, SELECT = 48, 48
+#: Declared parameters are fitted from so many starts.
+STARTS = 3
+
+Progress = Callable[[float, str], None]
+
+
+def trace(
+    model: Any,
+    data: Measurements,
+    declared: Sequence[str] = (),
+    *,
+    seed: int = 0,
+    candidates: Sequence[str] | None = None,
+    horizon: float | None = None,
+    calibrate: int = 0,
+    threads: int = 0,
+    progress: Progress | None = None,
+) -> Report:
+    """Find out which effect a model lacks to explain measured data.
+
+    The declared parameters are fitted first. Where the errors of the fitted model on unseen windows exceed those that
+    the measurement noise alone would leave, all effects of the library are fitted together and eliminated backwards;
+    what remains is tested for stability and for likeness with other effects, fitted again and judged on test runs that
+    nothing else has seen. The result is the same for the same seed.
+
+    :param model: MJCF path, MJCF text, ``MjSpec``, ``MjModel`` or gymnasium MuJoCo environment
+    :param data: recordings
+    :param declared: parameters of the model that may be fitted, as :func:`sb3_rpto.effects.declare` takes them
+    :param seed: of the split, the starts and the resampling
+    :param candidates: kinds of effects to look for; default: all registered ones
+    :param horizon: length of the windows in s; default: 0.5, shorter for short episodes
+    :param calibrate: recalibrate the threshold of selection on so many sets simulated from the fitted declared model
+    :param threads: that simulate; 0: one for each core
+    :param progress: called with the share done and what is being done
+    :return: the verdict, the effects, errors before and after, and the corrected model
+    :raises ValueError: data and model do not fit together, or the data are too few
+    """
+    say = progress or (lambda share, what: None)
+    source, compiled = load_model(model)
+    findings = [*data.findings, *check_against(compiled, data)]
+    train, select, test = data.split(seed)
+    findings += [f for f in train.findings if f not in findings]
+    fitted = replace(data, episodes=train.episodes + select.episodes)
+    sigma = noise_levels(fitted)
+    nominal = compiled.__copy__()
+    nominal.opt.timestep = time_step(nominal, data)
+    known = declare(nominal, declared)
+    effects: list[Effect] = [*known, *_candidates(nominal, [d.label for d in known], candidates)]
+    simulation = Simulation(nominal, effects, threads)
+    base_residuals = force_residuals(simulation, simulation.null, fitted)
+    scales = scales_for(effects, typical(simulation, base_residuals))
+    horizon = horizon or _horizon(fitted)
+    train_windows, select_windows, shared = _windows(nominal, train, select, sigma, horizon)
+    if shared:
+        findings.append(Finding("split", "training runs", shared))
+    fitting = Problem(simulation, train_windows, scales)
+    judging = Problem(simulation, select_windows, scales)
+
+    say(0.05, "fitting the declared parameters")
+    selector = Selector(fitting, judging, THRESHOLD, lambda what: say(0.6, what))
+    before = fit_declared(selector, seed)
+    base = Model((), before, judging.score(before.values).errors)
+    first = adequacy(judging, judging.score(before.values), seed)
+    screening: Screening | None = None
+    selection = Selection(base)
+    last = first
+    if not first.adequate:
+        say(0.15, "screening the candidates")
+        screening = screen(fitting, before)
+        selector.threshold = THRESHOLD
+        selection = search(selector, base, screening, say)
+        last = adequacy(judging, judging.score(selection.model.fit.values), seed)
+
+    say(0.85, "fitting the final model")
+    final, intervals = refit(simulation, selection, train_windows, select_windows, scales, seed)
+    verdict = judge(first, last, bool(selection.model.effects))
+    say(0.9, "predicting the test runs")
+    return _report(locals())
+
+
+def fit_declared(selector: Selector, seed: int) -> Fit:
+    """Fit the declared parameters from several starts, none at a bound, and keep the best."""
+    problem, free = selector.train, selector.free(())
+    begin = problem.simulation.null.copy()
+    best = problem.fit(begin, free, iterations=20)
+    if not len(free):
+        return best
+    rng = np.random.default_rng(seed)
+    for _ in range(STARTS - 1):
+        start = begin.copy()
+        step = rng.uniform(-3, 3, len(free)) * problem.size[free]
+        margin = 0.5 * problem.size[free]
+        start[free] = np.clip(begin[free] + step, problem.lower[free] + margin, problem.upper[free] - margin)
+        other = problem.fit(start, free, iterations=20)
+        if other.cost < 0.999 * best.cost:
+            best = other
+    return best
+
+
+def search(selector: Selector, base: Model, screening: Screening, say: Progress) -> Selection:
+    """Joint fit of all excited candidates, elimination backwards, substitution by like ones, a last look forward."""
+    simulation = selector.simulation
+    chosen: list[int] = []
+    for i, effect in enumerate(simulation.effects):
+        if effect.kind == "declared" or not screening.excited(i):
+            continue
+        if not any(j in chosen for j in screening.alike(i)):
+            chosen.append(i)
+    say(0.2, f"fitting {len(chosen)} candidates together")
+    full = selector.model(chosen, base.fit, iterations=20)
+    selection = selector.eliminate(full, base)
+    selection = selector.add_back(selection, chosen)
+    say(0.7, "trying like effects in their place")
+    selection = selector.substitute(selection, screening)
+    return selector.judge(selection)
+
+
+def refit(
+    simulation: Simulation,
+    selection: Selection,
+    train: Windows,
+    select: Windows,
+    scales: Sequence[Any],
+    seed: int,
+    resamples: int = 200,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fit on train and select together; intervals by resampling blocks.
+
+    :return: all parameters (p,), and their 2.5 % and 97.5 % quantiles (2, p)
+    """
+    joined = join(train, select)
+    problem = Problem(simulation, joined, scales)
+    free = Selector(problem, problem, 0.0, lambda _: None).free(selection.model.effects)
+    fit = problem.fit(selection.model.fit.values, free, iterations=10)
+    intervals = np.stack([fit.values, fit.values])
+    if len(free):
+        linear = problem.linear(fit, free)
+        ridge = 1e-9 * np.eye(len(free)) * max(1e-12, float(np.trace(linear.normal.sum(0))))
+        blocks = [np.flatnonzero(joined.block == b) for b in np.unique(joined.block)]
+        rng = np.random.default_rng(seed)
+        moves = []
+        for _ in range(resamples):
+            rows = np.concatenate([blocks[i] for i in rng.integers(len(blocks), size=len(blocks))])
+            # The mean gradient is not quite zero at a bound; only its scatter matters.
+            gradient = linear.gradient[rows].sum(0) - linear.gradient.sum(0) * len(rows) / len(joined)
+            moves.append(-np.linalg.solve(linear.normal[rows].sum(0) + ridge, gradient) * problem.size[free])
+        intervals[:, free] += np.quantile(moves, [0.025, 0.975], axis=0)
+        intervals = np.clip(intervals, problem.lower, problem.upper)
+    return fit.values, intervals
+
+
+def join(a: Windows, b: Windows) -> Windows:
+    """All windows of both, as blocks of their own."""
+    if b is a:
+        return a
+    columns = max(a.at.shape[1], b.at.shape[1])
+
+    def pad(values: np.ndarray) -> np.ndarray:
+        return np.pad(values, [(0, 0), (0, columns - values.shape[1])] + [(0, 0)] * (values.ndim - 2))
+
+    def both(name: str) -> np.ndarray:
+        return np.concatenate([getattr(a, name), getattr(b, name)])
+
+    enabled = None
+    if a.drive.enabled is not None or b.drive.enabled is not None:
+        parts = [w.drive.enabled if w.drive.enabled is not None else np.ones_like(w.drive.commands[:, w.drive.before :]) for w in (a, b)]
+        enabled = np.concatenate(parts)
+    drive = a.drive._replace(
+        commands=np.concatenate([a.drive.commands, b.drive.commands]),
+        enabled=enabled,
+        settings={k: np.concatenate([v, b.drive.settings[k]]) for k, v in a.drive.settings.items()},
+    )
+    return Windows(
+        both("qpos"),
+        both("qvel"),
+        both("spread"),
+        drive,
+        *(np.concatenate([pad(getattr(w, n)) for w in (a, b)]) for n in ("at", "measured", "usable")),
+        a.sigma,
+        a.columns,
+        np.concatenate([a.block, b.block + a.block.max() + 1]),
+        np.concatenate([a.episode, b.episode + a.episode.max() + 1]),
+    )
+
+
+def judge(before: Adequacy, after: Adequacy, named: bool) -> str:
+    """The verdict from adequacy before and after.
+
+    ``complete``: nothing is missing. ``explained``: what is left with the named effects is no more than noise.
+    ``partly explained``: they at least halve the excess log error. ``unexplained``: they do not.
+    """
+    if before.adequate:
+        return "complete"
+    if not named:
+        return "unexplained"
+    if after.adequate:
+        return "explained"
+    halved = np.log(max(after.ratio, 1.0)) <= 0.5 * np.log(max(before.ratio, 1.0))
+    return "partly explained" if halved else "unexplained"
+
+
+def _candidates(model: mujoco.MjModel, declared: list[str], kinds: Sequence[str] | None) -> list[Effect]:
+    if kinds is not None:
+        unknown = [k for k in kinds if k not in LIBRARY]
+        if unknown:
+            raise ValueError(f"candidates: no effect {unknown[0]!r} is registered; known: {', '.join(sorted(LIBRARY))}")
+    return [e for e in all_candidates(model, declared) if kinds is None or e.kind in kinds]
+
+
+def _horizon(data: Measurements) -> float:
+    """Half a second, at least eight samples, at most a third of the longest episode."""
+    step = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
+    longest = max(float(e.time[-1] - e.time[0]) for e in data.episodes)
+    return min(max(0.5, 8 * step), max(longest / 3, 3 * step))
+
+
+def _windows(
+    model: mujoco.MjModel, train: Measurements, select: Measurements, sigma: np.ndarray, horizon: float
+) -> tuple[Windows, Windows, str]:
+    """Windows to fit and to select on; where no run is set apart, blocks of the training runs take turns."""
+    if select.episodes:
+        return cut(model, train, sigma, horizon, TRAIN), cut(model, select, sigma, horizon, SELECT), ""
+    every = cut(model, train, sigma, horizon, TRAIN + SELECT)
+    # Three blocks to fit, one to select on; the windows beside a select block are left out as its gap.
+    turn = every.block % 4
+    chosen = turn == 3
+    if not chosen.any() or chosen.all():
+        return every, every, "too few blocks to set some apart: effects are selected on the windows they were fitted to"
+    beside = np.roll(chosen, 1) | np.roll(chosen, -1)
+    rest = ~chosen & ~(beside & (np.diff(every.episode, append=-1) == 0))
+    message = f"selected on {int(chosen.sum())} windows of the training runs, in blocks, with a gap of one window"
+    return every.take(np.flatnonzero(rest)), every.take(np.flatnonzero(chosen)), message
+
+
+def _report(state: dict[str, Any]) -> Report:
+    """Put together what :func:`trace` found."""
+    simulation: Simulation = state["simulation"]
+    selection: Selection = state["selection"]
+    screening: Screening | None = state["screening"]
+    final, intervals, seed = state["final"], state["intervals"], state["seed"]
+    test, sigma, fitted = state["test"], state["sigma"], state["fitted"]
+    threshold = state["selector"].threshold
+    rng = np.random.default_rng(seed)
+    labels = [e.label for e in simulation.effects]
+
+    def part(i: int, values: np.ndarray) -> np.ndarray:
+        return values[..., simulation.slices[i]]
+
+    kept = list(selection.model.effects)
+    traced = []
+    for i in kept:
+        evidence = selection.evidence[i]
+        traced.append(
+            Traced(
+                simulation.effects[i].with_values(part(i, final)),
+                part(i, intervals),
+                [labels[j] for j in selection.alike.get(i, [])],
+                evidence.gain,
+                evidence.t,
+                evidence.frequency(threshold, rng),
+            )
+        )
+    known = [
+        Traced(e.with_values(part(i, final)), part(i, intervals), [], 0.0, 0.0, 1.0)
+        for i, e in enumerate(simulation.effects)
+        if isinstance(e, Declared)
+    ]
+    rows = [
+        _candidate(i, e, screening, selection, labels)
+        for i, e in enumerate(simulation.effects)
+        if not isinstance(e, Declared)
+    ]
+    data = test if test.episodes else fitted
+    before = state["before"].values
+    residual_before = force_residuals(simulation, before, data)
+    residual_after = force_residuals(simulation, final, data)
+    return Report(
+        verdict=state["verdict"],
+        declared=known,
+        effects=traced,
+        candidates=rows,
+        adequacy_before=state["first"],
+        adequacy_after=state["last"],
+        before=horizon_errors(simulation, before, data, sigma, seed),
+        after=horizon_errors(simulation, final, data, sigma, seed),
+        floor=noise_floor(simulation, final, data, sigma, seed),
+        force_before=summary(residual_before),
+        force_after=summary(residual_after),
+        learnable=learnable_share(residual_after, seed),
+        residuals_before=residual_before,
+        residuals_after=residual_after,
+        findings=state["findings"],
+        noise=dict(zip(data.columns.qpos, sigma.tolist())),
+        runs={name: sorted({e.run for e in state[name].episodes}) for name in ("train", "select", "test")},
+        threshold=threshold,
+        horizon=state["horizon"],
+        seed=seed,
+        source=state["source"] if state["source"] is not None else state["compiled"],
+        simulation=simulation,
+        values_before=before,
+        values_after=final,
+        data=data,
+        sigma=sigma,
+    )
+
+
+def _candidate(
+    i: int, effect: Effect, screening: Screening | None, selection: Selection, labels: list[str]
+) -> Candidate:
+    if screening is None:
+        return Candidate(effect.label, "not needed", "the declared model is complete", 0.0)
+    sensitivity = float(screening.sensitivity[i])
+    alike = [labels[j] for j in screening.alike(i)]
+    if i in selection.model.effects:
+        return Candidate(effect.label, "kept", "its removal raises the error of the select windows", sensitivity, alike)
+    for kept, others in selection.alike.items():
+        if i in others:
+            return Candidate(effect.label, "alike", f"explains the data as well as {labels[kept]}", sensitivity, alike)
+    if not screening.excited(i):
+        return Candidate(effect.label, "not excited", f"to see it: {effect.excite}", sensitivity, alike)
+    if i in selection.dropped:
+        step, evidence = selection.dropped[i]
+        why = "hardly matters in the joint fit" if evidence is None else (
+            f"removal costs {evidence.gain:+.1%} of the error (t = {evidence.t:.1f})"
+        )
+        return Candidate(effect.label, "dropped", f"step {step}: {why}", sensitivity, alike)
+    return Candidate(effect.label, "dropped", f"looks like {alike[0]}" if alike else "not fitted", sensitivity, alike)

@@ -1,0 +1,269 @@
+"""Windows of multiple shooting: short stretches of a recording, each simulated from its own start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from sb3_rpto.effects import Drive
+from sb3_rpto.effects.names import SCALAR_JOINTS, object_id, object_names
+from sb3_rpto.effects.simulation import names_of
+from sb3_rpto.tracing import checks
+from sb3_rpto.tracing.episodes import Episode
+from sb3_rpto.tracing.measurements import Measurements
+
+#: Seconds of commands kept from before a window, for delays and filters.
+MEMORY = 0.25
+#: Exact data (from a simulator) count as noisy by this share of a position's standard deviation.
+EXACT = 1e-4
+#: Longest integration step in s for measured data.
+FINEST = 0.001
+#: Half the time, in s, over which the state at a window's start is smoothed, and the fewest samples on each side.
+HALF_WIDTH, HALF_COUNT = 0.025, 4
+
+
+@dataclass(frozen=True)
+class Windows:
+    """``W`` windows of one length with their starts, their commands and what was measured.
+
+    :param qpos: smoothed positions at the start, as the sensors show them, (W, nq)
+    :param qvel: smoothed velocities there, (W, nv)
+    :param spread: standard deviation of that start, positions then velocities, (W, 2 nv); zeros for exact data
+    :param drive: commands on the grid of the time step
+    :param at: samples on that grid, in steps from the start, (W, S); fractional where the clock jitters
+    :param measured: positions of the observed columns, (W, S, m)
+    :param usable: False for samples that do not count, (W, S)
+    :param sigma: measurement noise of each observed column, (m,)
+    :param columns: addresses of the observed columns in qpos, (m,)
+    :param block: number of the block of neighbouring windows, (W,); blocks are taken as independent
+    :param episode: index of the episode, (W,)
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    spread: np.ndarray
+    drive: Drive
+    at: np.ndarray
+    measured: np.ndarray
+    usable: np.ndarray
+    sigma: np.ndarray
+    columns: np.ndarray
+    block: np.ndarray
+    episode: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.qpos)
+
+    def take(self, index: np.ndarray) -> Windows:
+        """The windows at ``index``."""
+        return Windows(
+            *(getattr(self, name)[index] for name in ("qpos", "qvel", "spread")),
+            self.drive.take(index),
+            *(getattr(self, name)[index] for name in ("at", "measured", "usable")),
+            self.sigma,
+            self.columns,
+            self.block[index],
+            self.episode[index],
+        )
+
+
+def noise_levels(data: Measurements) -> np.ndarray:
+    """Standard deviation of the measurement noise of each position column, (m,).
+
+    Divided differences of order k, scaled to unit variance for white noise, vanish on polynomials of degree k - 1 on
+    any clock. The lowest order from 3 on is used whose successor finds no less: then no motion is left in it.
+    """
+    levels = []
+    for i in range(len(data.columns.qpos)):
+        if data.exact:
+            spread = np.std(np.concatenate([e.qpos[:, i] for e in data.episodes]))
+            levels.append(EXACT * max(float(spread), 1e-3))
+            continue
+        at = [_difference_noise(data.episodes, i, order) for order in range(3, 8)]
+        order = next((k for k in range(4) if at[k + 1] > 0.93 * at[k]), 4)
+        steps = [checks.quantum(e.qpos[:, i]) or 0.0 for e in data.episodes]
+        # A smooth signal without noise still has the rounding of its file.
+        levels.append(max(at[order], float(np.median(steps)) / math.sqrt(12), 1e-7))
+    return np.array(levels)
+
+
+def _difference_noise(episodes: Sequence[Episode], column: int, order: int) -> float:
+    found = []
+    for e in episodes:
+        if len(e) <= order:
+            continue
+        t = np.lib.stride_tricks.sliding_window_view(e.time, order + 1)
+        q = np.lib.stride_tricks.sliding_window_view(e.qpos[:, column], order + 1)
+        gaps = t[:, :, None] - t[:, None, :]
+        gaps = gaps / np.abs(gaps).max(axis=(1, 2), keepdims=True)
+        weights = 1 / np.prod(np.where(np.eye(order + 1, dtype=bool), 1.0, gaps), axis=2)
+        found.append((weights * q).sum(1) / np.sqrt((weights**2).sum(1)))
+    return float(np.median(np.abs(np.concatenate(found)))) / 0.6745 if found else 0.0
+
+
+def smoothed_state(episode: Episode, index: int, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position and velocity of the scalar columns at a sample by a local cubic in time, and their spread.
+
+    :param index: of the sample
+    :param sigma: noise of the position columns, (m,)
+    :return: positions (m,), velocities (m,), standard deviations of both (2, m)
+    """
+    step = float(np.median(np.diff(episode.time)))
+    half = max(HALF_COUNT, round(HALF_WIDTH / step))
+    first, last = max(0, index - half), min(len(episode), index + half + 1)
+    t = episode.time[first:last] - episode.time[index]
+    scale = np.abs(t).max()
+    basis = np.vander(t / scale, 4, increasing=True)
+    inverse = np.linalg.pinv(basis)
+    coefficients = inverse @ episode.qpos[first:last]
+    spread = np.sqrt(np.sum(inverse[:2] ** 2, axis=1))[:, None] * sigma
+    return coefficients[0], coefficients[1] / scale, spread / np.array([[1.0], [scale]])
+
+
+def time_step(model: mujoco.MjModel, data: Measurements) -> float:
+    """Integration step for the data in s: the model's own for exact data, else a whole fraction of it below 1 ms.
+
+    At a reversal dry friction errs by up to a step: half a radian a second per millisecond is easily seen.
+    """
+    h = float(model.opt.timestep)
+    return h if data.exact else h / math.ceil(h / FINEST - 1e-9)
+
+
+def cut(
+    model: mujoco.MjModel, data: Measurements, sigma: np.ndarray, horizon: float, most: int, blocks: float = 1.0
+) -> Windows:
+    """Lay windows side by side over all episodes.
+
+    :param model: gives the time step and the order of the coordinates
+    :param data: recordings
+    :param sigma: noise of each position column of the data
+    :param horizon: length of a window in s
+    :param most: at most so many windows, evenly chosen
+    :param blocks: least length of a block of windows in s
+    :raises ValueError: no episode is as long as a window
+    """
+    starts = []
+    for number, e in enumerate(data.episodes):
+        step = float(np.median(np.diff(e.time)))
+        begin = 0 if data.exact else min(max(HALF_COUNT, round(HALF_WIDTH / step)), len(e) - 1)
+        while True:
+            end = int(np.searchsorted(e.time, e.time[begin] + horizon + 1e-9, side="right"))
+            if e.time[-1] < e.time[begin] + horizon - 1e-9 or end - begin < 3:
+                break
+            if e.usable[begin] and e.usable[begin:end].mean() > 0.5:
+                starts.append((number, begin, end))
+                begin = end - 1
+            else:
+                begin += 1
+    if not starts:
+        longest = max(e.time[-1] - e.time[0] for e in data.episodes)
+        raise ValueError(f"no episode holds a window of {horizon:g} s (the longest has {longest:.3g} s); lower horizon")
+    if len(starts) > most:
+        starts = [starts[i] for i in np.linspace(0, len(starts) - 1, most).round().astype(int)]
+    return _build(model, data, sigma, horizon, starts, blocks)
+
+
+def _build(
+    model: mujoco.MjModel,
+    data: Measurements,
+    sigma: np.ndarray,
+    horizon: float,
+    starts: Sequence[tuple[int, int, int]],
+    blocks: float,
+) -> Windows:
+    h = float(model.opt.timestep)
+    steps, before = math.ceil(horizon / h - 1e-6), math.ceil(MEMORY / h)
+    count, samples = len(starts), max(end - begin for _, begin, end in starts) - 1
+    observed = [i for i, name in enumerate(data.columns.qpos) if name not in data.unobserved]
+    addresses = names_of(model, data.columns.qpos)
+    actuators = command_order(model, data)
+    qpos, qvel = np.tile(model.qpos0, (count, 1)), np.zeros((count, model.nv))
+    spread = np.zeros((count, 2 * model.nv))
+    commands = np.zeros((count, before + steps, model.nu))
+    enabled = np.ones((count, steps, model.nu))
+    at, usable = np.zeros((count, samples)), np.zeros((count, samples), dtype=bool)
+    measured = np.zeros((count, samples, len(observed)))
+    block = np.zeros(count, dtype=int)
+    last: tuple[int, float] = (-1, 0.0)
+    for w, (number, begin, end) in enumerate(starts):
+        e = data.episodes[number]
+        t0 = e.time[begin]
+        qpos[w], qvel[w], spread[w] = start_state(model, data, e, begin, sigma, addresses)
+        grid = t0 + h * np.arange(-before, steps)
+        row = np.clip(np.searchsorted(e.time, grid + 1e-6 * h, side="right") - 1, 0, len(e) - 1)
+        commands[w][:, actuators] = e.ctrl[row]
+        enabled[w][:, actuators] = e.enabled[row[before:]]
+        n = end - begin - 1
+        at[w, :n] = np.minimum((e.time[begin + 1 : end] - t0) / h, steps)
+        # The model's grid is the clock's where both agree to a thousandth of a step.
+        whole = np.round(at[w])
+        at[w] = np.where(np.abs(at[w] - whole) < 1e-3, whole, at[w])
+        measured[w, :n] = e.qpos[begin + 1 : end][:, observed]
+        usable[w, :n] = e.usable[begin + 1 : end]
+        if number != last[0] or t0 - last[1] >= blocks - 1e-9:
+            last = (number, t0)
+            block[w] = block[w - 1] + 1 if w else 0
+        else:
+            block[w] = block[w - 1]
+    settings = {name: np.array([data.episodes[n].params[name] for n, _, _ in starts]) for name in data.columns.params}
+    drive = Drive(commands, before, None if enabled.all() else enabled, settings)
+    return Windows(
+        qpos,
+        qvel,
+        spread,
+        drive,
+        at,
+        measured,
+        usable,
+        sigma[observed],
+        addresses[observed],
+        block,
+        np.array([number for number, _, _ in starts]),
+    )
+
+
+def start_state(
+    model: mujoco.MjModel, data: Measurements, episode: Episode, index: int, sigma: np.ndarray, addresses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The state of the model at a sample: qpos (nq,), qvel (nv,), spread (2 nv,)."""
+    qpos, qvel, spread = model.qpos0.copy(), np.zeros(model.nv), np.zeros(2 * model.nv)
+    dofs = velocity_addresses(model, data)
+    if data.exact:
+        qpos[addresses] = episode.qpos[index]
+        qvel[dofs] = episode.qvel[index]
+        return qpos, qvel, spread
+    position, velocity, deviation = smoothed_state(episode, index, sigma)
+    qpos[addresses] = position
+    scalar = {int(model.jnt_qposadr[j]): int(model.jnt_dofadr[j]) for j in scalar_joints(model)}
+    if len(scalar) < model.njnt:
+        qvel[dofs] = episode.qvel[index]
+    for i, address in enumerate(addresses):
+        if int(address) in scalar:
+            dof = scalar[int(address)]
+            qvel[dof] = velocity[i]
+            spread[[dof, model.nv + dof]] = deviation[:, i]
+    return qpos, qvel, spread
+
+
+def scalar_joints(model: mujoco.MjModel) -> list[int]:
+    """Ids of hinges and slides."""
+    return [j for j in range(model.njnt) if model.jnt_type[j] in SCALAR_JOINTS]
+
+
+def velocity_addresses(model: mujoco.MjModel, data: Measurements) -> np.ndarray:
+    """Addresses in qvel of the data's velocity columns."""
+    joints = object_names(model, "joint")
+    out = []
+    for name in data.columns.qvel:
+        joint, offset = (name, 0) if name in joints else (name.rpartition(".")[0], int(name.rpartition(".")[2]))
+        out.append(int(model.jnt_dofadr[joints.index(joint)]) + offset)
+    return np.array(out, dtype=int)
+
+
+def command_order(model: mujoco.MjModel, data: Measurements) -> list[int]:
+    """Ids of the data's actuators in the model."""
+    return [object_id(model, "actuator", name) for name in data.columns.ctrl]
