@@ -111,6 +111,9 @@ class Simulation:
             world.commit()
             record = world.batch.rollout(steps, commands, record=("qpos", "qvel"))
             out_q[:, 1:], out_v[:, 1:] = record["qpos"], record["qvel"]
+            # A rollout holds a simulation at its first warning; here that is the end of it.
+            for i in np.flatnonzero(world.batch.warning[:, :, 1].any(axis=1)):
+                out_q[i, (out_q[i] == out_q[i, -1]).all(axis=-1)] = np.nan
         bad = ~(np.isfinite(out_q).all(-1) & (np.abs(out_v) < 1e6).all(-1))
         if bad.any():
             bad = np.maximum.accumulate(bad, axis=1)
@@ -137,10 +140,6 @@ def prepare(world: World, active: Active) -> None:
     """Write what the effects change of the model: numbers that were declared first, additions after."""
     for effect, x in sorted(active, key=lambda pair: not isinstance(pair[0], Declared)):
         effect.write(world, x)
-    for effect, _ in active:
-        # Dry friction that varies goes through the solver too, so its joint must be ready for it.
-        if effect.overrides("act") and effect.place == "joint":
-            world.rough(effect.dof)
     world.settle()
 
 

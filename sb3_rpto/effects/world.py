@@ -32,6 +32,8 @@ class World(ABC):
         self.force = np.zeros((n, model.nv))  # N·m or N, added to the generalised forces
         self.friction = np.zeros((n, model.nv))  # N·m or N, added to the level of dry friction
         self._nominal: dict[str, np.ndarray] = {}
+        self._base_friction: np.ndarray | None = None  # (n, nv), before the substep's own
+        self._dry = np.zeros(model.nv, dtype=bool)  # joints whose friction has varied since settle
 
     @abstractmethod
     def _live(self, name: str) -> np.ndarray:
@@ -55,6 +57,8 @@ class World(ABC):
         """Derive the constants that follow from the fields, and keep the level of dry friction."""
         if any(name in _DERIVING for name in self._nominal):
             self._set_const()
+        self._dry[:] = False
+        self._base_friction = None
         if "dof_frictionloss" in self._nominal:
             self._base_friction = self._live("dof_frictionloss").copy()
 
@@ -65,16 +69,25 @@ class World(ABC):
     def rough(self, dof: int) -> None:
         """Make a joint ready for dry friction that holds: the stiffest constraint that the time step allows.
 
-        MuJoCo's default lets a loaded joint creep at up to about a tenth of a radian a second.
+        MuJoCo's default lets a loaded joint creep at up to about a tenth of a radian a second. A joint whose model has
+        dry friction already keeps the model's own constraint, so that a little more changes only a little.
         """
         self.field("dof_frictionloss")
-        self.field("dof_solref")[:, dof] = (2 * self.model.opt.timestep, 1.0)
-        self.field("dof_solimp")[:, dof] = (0.99, 0.99, 0.001, 0.5, 2.0)
+        if self.model.dof_frictionloss[dof] == 0:
+            self.field("dof_solref")[:, dof] = (2 * self.model.opt.timestep, 1.0)
+            self.field("dof_solimp")[:, dof] = (0.99, 0.99, 0.001, 0.5, 2.0)
 
     def commit(self) -> None:
         """Write the collected ``force`` and ``friction`` to the physics."""
         self._applied()[:] = self.force
-        if "dof_frictionloss" in self._nominal:
+        dry = self.friction.any(axis=0)
+        if dry.any():
+            if self._base_friction is None:
+                self._base_friction = self.field("dof_frictionloss").copy()
+            for dof in np.flatnonzero(dry & ~self._dry):
+                self.rough(int(dof))
+            self._dry |= dry
+        if self._dry.any() and self._base_friction is not None:
             np.maximum(self._base_friction + self.friction, 0.0, out=self._live("dof_frictionloss"))
 
     @abstractmethod

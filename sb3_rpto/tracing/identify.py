@@ -65,7 +65,7 @@ class Problem:
     """
 
     def __init__(self, simulation: Simulation, windows: Windows, scales: Sequence[Scales]) -> None:
-        self.simulation, self.windows = simulation, windows
+        self.simulation, self.windows, self.scales = simulation, windows, scales
         parameters = [(p, s) for e, s in zip(simulation.effects, scales) for p in e.parameters]
         self.size = np.array([p.size_for(s) for p, s in parameters])
         self.lower = np.array([p.lower for p, _ in parameters])
@@ -73,9 +73,11 @@ class Problem:
         self.null = simulation.null
         self.declared = np.array([e.kind == "declared" for e in simulation.effects for _ in e.parameters], dtype=bool)
         self.moving = np.flatnonzero((windows.spread > 0).any(axis=0))  # coordinates of the start that are free
-        self.sensors = [
-            (e, s) for e, s in zip(simulation.effects, simulation.slices) if e.overrides("observe")
-        ]
+        self.sensors = [(e, s) for e, s in zip(simulation.effects, simulation.slices) if e.overrides("observe")]
+
+    def on(self, index: np.ndarray) -> Problem:
+        """The same problem on the windows at ``index``."""
+        return Problem(self.simulation, self.windows.take(index), self.scales)
 
     # --- prediction ---------------------------------------------------------------------------------------------
 
@@ -111,7 +113,9 @@ class Problem:
     def _dofs(self) -> np.ndarray:
         """Address in qvel of each observed column, -1 for a coordinate without a velocity of its own."""
         model = self.simulation.model
-        dof_of = {int(model.jnt_qposadr[j]): int(model.jnt_dofadr[j]) for j in range(model.njnt) if model.jnt_type[j] > 1}
+        dof_of = {
+            int(model.jnt_qposadr[j]): int(model.jnt_dofadr[j]) for j in range(model.njnt) if model.jnt_type[j] > 1
+        }
         return np.array([dof_of.get(int(c), -1) for c in self.windows.columns])
 
     def residuals(self, values: np.ndarray, starts: np.ndarray, index: np.ndarray) -> np.ndarray:
@@ -172,8 +176,9 @@ class Problem:
         if not jx.shape[2]:
             return _Reduced(htt, gt, np.zeros((len(r), 0, jt.shape[2])), np.zeros((len(r), 0)))
         wx = jx * weight[:, :, None]
-        hxx = np.einsum("wrx,wry->wxy", wx, jx) + np.eye(jx.shape[2])
-        hxt, gx = np.einsum("wrx,wrf->wxf", wx, jt), np.einsum("wrx,wr->wx", wx, r) + starts[:, self.moving]
+        prior = hold(clip)
+        hxx = np.einsum("wrx,wry->wxy", wx, jx) + prior * np.eye(jx.shape[2])
+        hxt, gx = np.einsum("wrx,wrf->wxf", wx, jt), np.einsum("wrx,wr->wx", wx, r) + prior * starts[:, self.moving]
         gain, move = np.linalg.solve(hxx, hxt), np.linalg.solve(hxx, gx[:, :, None])[:, :, 0]
         normal = htt - np.einsum("wxf,wxg->wfg", hxt, gain)
         gradient = gt - np.einsum("wxf,wx->wf", hxt, move)
@@ -183,7 +188,7 @@ class Problem:
         """Robust cost of one or more candidates: r (..., W, R), starts (..., W, 2 nv), values (..., p)."""
         soft = 2 * clip**2 * (np.sqrt(1 + (r / clip) ** 2) - 1)
         pull = np.where(self.declared, 0.0, (values - self.null) / self.size / RIDGE) ** 2
-        return soft.sum((-1, -2)) + (starts**2).sum((-1, -2)) + pull.sum(-1)
+        return soft.sum((-1, -2)) + hold(clip) * (starts**2).sum((-1, -2)) + pull.sum(-1)
 
     def fit(
         self,
@@ -204,39 +209,41 @@ class Problem:
         """
         values, damping = values.copy(), 1e-3
         starts = np.zeros((len(self.windows), 2 * self.simulation.model.nv)) if starts is None else starts.copy()
-        count = len(self.windows)
-        r = np.zeros(0)
-        small = 0
         for _ in range(iterations):
             r, jt, jx = self.linearise(values, starts, free)
-            clip = 3 * max(1.0, 1.4826 * float(np.median(np.abs(r))))
+            clip = robust_scale(r)
             now = float(self.cost(r, starts, values, clip))
             reduced = self.reduce(r, jt, jx, starts, clip)
-            tries = damping * np.array([0.1, 1.0, 10.0, 100.0]) if len(free) else np.array([damping])
-            steps = [self._step(values, free, reduced, d) for d in tries]
-            trial_values = np.stack([values + s for s in steps])
-            trial_starts = np.repeat(starts[None], len(tries), 0)
-            for t, s in enumerate(steps):
-                trial_starts[t][:, self.moving] -= reduced.move + reduced.gain @ (s[free] / self.size[free])
-            trial_starts = np.clip(trial_starts, -10, 10)
-            index = np.tile(np.arange(count), len(tries))
-            trial_r = self.residuals(
-                np.repeat(trial_values, count, 0), trial_starts.reshape(len(tries) * count, -1), index
-            ).reshape(len(tries), count, -1)
-            costs = self.cost(trial_r, trial_starts, trial_values, clip)
-            best = int(np.argmin(costs))
-            if not costs[best] < now:
-                damping *= 1000
-                if damping > 1e8:
+            for dampings in (damping * np.array([0.1, 1.0, 10.0, 100.0]), damping * np.array([1e4, 1e6])):
+                trial = self._try(values, starts, free, reduced, dampings if len(free) else dampings[:1])
+                costs = self.cost(trial.residuals, trial.starts, trial.values, clip)
+                best = int(np.argmin(costs))
+                if costs[best] < now:
                     break
-                continue
-            values, starts, r = trial_values[best], trial_starts[best], trial_r[best]
-            damping = max(1e-6, float(tries[best]))
-            small = small + 1 if now - costs[best] < tolerance * now else 0
-            if small:
+            else:
                 break
-        clip = 3 * max(1.0, 1.4826 * float(np.median(np.abs(r))))
-        return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, clip)))
+            values, starts, r = trial.values[best], trial.starts[best], trial.residuals[best]
+            damping = float(np.clip(dampings[best], 1e-6, 1e6))
+            if now - costs[best] < tolerance * now:
+                break
+        return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, robust_scale(r))))
+
+    def _try(
+        self, values: np.ndarray, starts: np.ndarray, free: np.ndarray, reduced: _Reduced, dampings: np.ndarray
+    ) -> _Trial:
+        """Simulate the steps of several dampings side by side."""
+        count, tries = len(self.windows), len(dampings)
+        steps = np.stack([self._step(values, free, reduced, d) for d in dampings])
+        moves = reduced.move + np.einsum("wxf,tf->twx", reduced.gain, steps[:, free] / self.size[free])
+        trial_starts = np.repeat(starts[None], tries, 0)
+        trial_starts[:, :, self.moving] -= moves
+        trial_values = values + steps
+        r = self.residuals(
+            np.repeat(trial_values, count, 0),
+            trial_starts.reshape(tries * count, -1),
+            np.tile(np.arange(count), tries),
+        )
+        return _Trial(trial_values, trial_starts, r.reshape(tries, count, -1))
 
     def _step(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced, damping: float) -> np.ndarray:
         """A damped Gauss-Newton step within the bounds, (p,); what would leave them is held there."""
@@ -255,8 +262,7 @@ class Problem:
     def linear(self, fit: Fit, free: np.ndarray) -> Linear:
         """The reduced normal equations at a fit, for screening, elimination and intervals."""
         r, jt, jx = self.linearise(fit.values, fit.starts, free)
-        clip = 3 * max(1.0, 1.4826 * float(np.median(np.abs(r))))
-        reduced = self.reduce(r, jt, jx, fit.starts, clip)
+        reduced = self.reduce(r, jt, jx, fit.starts, robust_scale(r))
         return Linear(reduced.normal, reduced.gradient, free)
 
     def score(self, values: np.ndarray, iterations: int = 2) -> Fit:
@@ -286,6 +292,23 @@ class _Reduced:
     gradient: np.ndarray  # (W, f)
     gain: np.ndarray  # (W, x, f), how the starts follow the parameters
     move: np.ndarray  # (W, x), how the starts move by themselves
+
+
+@dataclass(frozen=True)
+class _Trial:
+    values: np.ndarray  # (t, p)
+    starts: np.ndarray  # (t, W, 2 nv)
+    residuals: np.ndarray  # (t, W, R)
+
+
+def robust_scale(r: np.ndarray) -> float:
+    """Where the soft-L1 loss turns linear: three typical residuals, at least three units of noise."""
+    return 3 * max(1.0, 1.4826 * float(np.median(np.abs(r))))
+
+
+def hold(clip: float) -> float:
+    """How firmly the starts are held: where the model errs by more than noise, they must not make up for it."""
+    return (clip / 3) ** 2
 
 
 def bounded_step(normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

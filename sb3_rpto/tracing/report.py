@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,14 +12,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
+from sb3_rpto.effects.carry import carried_by, save_corrected
+from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import Adequacy
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evaluate import HorizonError
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.residuals import ForceResidual
+from sb3_rpto.version import __version__
 
 if TYPE_CHECKING:
     import gymnasium as gym
+
+#: Of ``report.json``.
+FORMAT = 1
 
 
 @dataclass(frozen=True)
@@ -134,50 +141,83 @@ class Report:
         return apply_effects(env, self.correction)
 
     def __str__(self) -> str:
-        joints = self.before[0].joints if self.before else ()
-        lines = [f"verdict: {self.verdict}", "", "model", f"  {self.equation()}"]
-        lines += [f"  {t}" for t in self.declared]
+        means, _ = wording.VERDICTS[self.verdict]
+        lines = [f"verdict: {self.verdict}", f"  {means}", "", "model", f"  {self.equation()}"]
+        if self.declared:
+            lines += ["", "declared parameters, fitted [95 % interval]", *wording.aligned(self._values(self.declared))]
         if self.effects:
-            claim = "lacks" if self.verdict == "explained" else "is closer to the data with"
-            lines += ["", f"it {claim}"]
-            for t in self.effects:
-                alike = f"; the data cannot tell it from {', '.join(t.alike)}" if t.alike else ""
-                carried = "in the MJCF" if t.effect.native else "carried by the environment wrapper"
-                lines.append(f"  {t}")
-                lines.append(
-                    f"    saves {t.gain:.0%} of the window error (t = {t.t:.1f}, selected in {t.frequency:.0%} of "
-                    f"resamples){alike}; {carried}"
-                )
-        lines += ["", f"adequacy on select windows: before {self.adequacy_before}, after {self.adequacy_after}"]
-        lines += ["", f"error on test runs, RMSE [95 % interval]: {', '.join(joints)}"]
-        floors = {f.horizon: f for f in self.floor}
-        for before, after in zip(self.before, self.after):
-            at = before.horizon if isinstance(before.horizon, str) else f"{before.horizon:g} s"
-            for j, joint in enumerate(joints):
-                floor = floors.get(before.horizon)
-                noise = f", noise floor {floor.rmse[j]:.4g}" if floor is not None else ""
-                lines.append(
-                    f"  {at:>9}  {joint:<12} {before.rmse[j]:.4g} [{before.low[j]:.4g}, {before.high[j]:.4g}] -> "
-                    f"{after.rmse[j]:.4g} [{after.low[j]:.4g}, {after.high[j]:.4g}]{noise}"
-                )
-        force = [f"{a:.3g} -> {b:.3g}" for a, b in zip(self.force_before, self.force_after)]
-        lines += [f"  force residual by inverse dynamics: {', '.join(force)}"]
-        share = ", ".join(f"{s:.0%}" for s in self.learnable)
-        lines += [f"  a small regressor predicts {share} of what is left of it"]
-        idle = [c for c in self.candidates if c.status == "not excited"]
+            claim = "it lacks" if self.verdict == "explained" else "closer to the data with, but not explained by"
+            lines += ["", claim, *wording.aligned(self._values(self.effects)), *self._evidence()]
+        lines += ["", "adequacy R: error over that of noise alone, on select windows; 1 where nothing is missing"]
+        lines += [f"  before {self.adequacy_before}, after {self.adequacy_after}"]
+        tested = "test runs" if self.runs["test"] else "the fitted runs, as there are no test runs"
+        lines += ["", f"error on {tested}: RMSE [95 % interval, of whole runs their range]"]
+        lines += wording.aligned(self._errors())
+        lines += ["", "missing force by inverse dynamics, RMS; share of the rest that a small regressor predicts"]
+        lines += wording.aligned(self._forces())
+        idle = [[c.label, c.reason] for c in self.candidates if c.status == "not excited"]
         if idle:
-            lines += ["", "not excited by these data"] + [f"  {c.label}: {c.reason}" for c in idle]
+            lines += ["", "not excited by these data", *wording.aligned(idle)]
         if self.findings:
-            lines += ["", "findings"] + [f"  {f}" for f in self.findings]
+            lines += ["", "findings", *(f"  {f}" for f in self.findings)]
         return "\n".join(lines)
 
+    def _values(self, found: list[Traced]) -> list[list[str]]:
+        """A row for each parameter: place, name, value, interval, unit."""
+        rows = []
+        for t in found:
+            label = t.label
+            for p, value, (low, high) in zip(t.effect.parameters, t.effect.values, t.interval.T):
+                name = "" if isinstance(t.effect, Declared) else p.name
+                unit = wording.unit_at(t.effect, p.unit, self.simulation.model)
+                rows.append([label, name, wording.number(value), wording.interval(low, high), unit])
+                label = ""
+        return rows
+
+    def _evidence(self) -> list[str]:
+        lines = []
+        for t in self.effects:
+            where = "in model.xml" if carried_by(t.effect) == "mjcf" else "in effects.json, by the environment wrapper"
+            lines.append(
+                f"  {t.label}: saves {wording.percent(t.gain)} of the window error (t = {t.t:.1f}, needed "
+                f"{self.threshold:.1f}), selected in {wording.percent(t.frequency)} of resamples; carried {where}"
+            )
+            if t.alike:
+                lines.append(f"    the data cannot tell it from {', '.join(t.alike)}")
+        return lines
+
+    def _errors(self) -> list[list[str]]:
+        """A row for each horizon and joint."""
+        floors = {f.horizon: f for f in self.floor}
+        rows = [["", "", "", "before", "", "after", "", "noise floor"]]
+        for before, after in zip(self.before, self.after):
+            at = before.horizon if isinstance(before.horizon, str) else f"{before.horizon:g} s"
+            for j, joint in enumerate(before.joints):
+                cells = [at if j == 0 else "", joint, wording.position_unit(self.simulation.model, joint)]
+                for e in (before, after):
+                    cells += [wording.number(e.rmse[j]), wording.interval(e.low[j], e.high[j], 3)]
+                floor = floors.get(before.horizon)
+                rows.append([*cells, "" if floor is None else wording.number(floor.rmse[j])])
+        return rows
+
+    def _forces(self) -> list[list[str]]:
+        """A row for each hinge and slide."""
+        model = self.simulation.model
+        rows = [["", "", "before", "after", "learnable"]]
+        for d in wording.scalar_dofs(model):
+            sizes = [wording.number(f[d], 3) for f in (self.force_before, self.force_after)]
+            unit = wording.force_unit(model, d)
+            rows.append([wording.dof_name(model, d), unit, *sizes, wording.percent(self.learnable[d])])
+        return rows
+
     def equation(self) -> str:
-        """The corrected model in a line."""
-        terms = [t.effect.equation if not t.effect.on else f"[{t.effect.on}] {t.effect.equation}" for t in self.effects]
-        return " + ".join(["M(q) qdd + c(q, qd) = tau + passive(q, qd)", *terms])
+        """The corrected model in a line, with the values found."""
+        return wording.equation([t.effect for t in self.effects])
 
     def to_json(self) -> dict[str, Any]:
-        """Everything but the recordings, for ``report.json``."""
+        """Everything but the recordings, for ``report.json``, in Python's own types; None for what is not finite."""
+
+        model = self.simulation.model
 
         def errors(found: list[HorizonError]) -> list[dict[str, Any]]:
             return [
@@ -185,7 +225,13 @@ class Report:
                     "horizon": e.horizon,
                     "windows": e.windows,
                     "joints": {
-                        name: {"rmse": e.rmse[j], "low": e.low[j], "high": e.high[j], "mae": e.mae[j]}
+                        name: {
+                            "rmse": e.rmse[j],
+                            "low": e.low[j],
+                            "high": e.high[j],
+                            "mae": e.mae[j],
+                            "unit": wording.position_unit(model, name),
+                        }
                         for j, name in enumerate(e.joints)
                     },
                 }
@@ -196,7 +242,7 @@ class Report:
             return {
                 "label": t.label,
                 "parameters": {
-                    p.name: {"value": v, "low": low, "high": high, "unit": p.unit}
+                    p.name: {"value": v, "low": low, "high": high, "unit": wording.unit_at(t.effect, p.unit, model)}
                     for p, v, (low, high) in zip(t.effect.parameters, t.effect.values, t.interval.T)
                 },
                 "equation": t.effect.equation,
@@ -204,11 +250,17 @@ class Report:
                 "gain": t.gain,
                 "t": t.t,
                 "frequency": t.frequency,
-                "carried_by": "mjcf" if t.effect.native or isinstance(t.effect, Declared) else "wrapper",
+                "carried_by": carried_by(t.effect),
             }
 
-        return {
+        def forces(values: np.ndarray) -> dict[str, float]:
+            return {wording.dof_name(model, d): values[d] for d in wording.scalar_dofs(model)}
+
+        found = {
+            "format": FORMAT,
+            "version": __version__,
             "verdict": self.verdict,
+            "equation": self.equation(),
             "declared": [traced(t) for t in self.declared],
             "effects": [traced(t) for t in self.effects],
             "candidates": [vars(c) for c in self.candidates],
@@ -217,9 +269,9 @@ class Report:
             "before": errors(self.before),
             "after": errors(self.after),
             "floor": errors(self.floor),
-            "force_before": self.force_before,
-            "force_after": self.force_after,
-            "learnable": self.learnable,
+            "force_before": forces(self.force_before),
+            "force_after": forces(self.force_after),
+            "learnable": forces(self.learnable),
             "findings": [vars(f) for f in self.findings],
             "noise": self.noise,
             "runs": self.runs,
@@ -227,30 +279,51 @@ class Report:
             "horizon": self.horizon,
             "seed": self.seed,
         }
+        plain: dict[str, Any] = _plain(found)
+        return plain
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write ``report.html``, ``report.json`` and the corrected model (``model.xml`` and ``effects.json``).
 
         :param folder: made if absent; files in it are replaced one by one, each whole
         :return: the folder
+        :raises ImportError: matplotlib is not installed; nothing is written then
+        :raises ValueError: the model came as an ``MjModel``, whose MJCF nothing tells; nothing is written then
         """
-        from sb3_rpto.effects.carry import save_corrected
         from sb3_rpto.tracing.html import render
 
         out = Path(folder)
-        out.mkdir(parents=True, exist_ok=True)
+        # Rendered before anything is written: what fails leaves the folder as it was.
+        page, data = render(self), json.dumps(self.to_json(), indent=1, allow_nan=False, ensure_ascii=False)
         save_corrected(out, self.source, self.correction)
-        write_atomically(out / "report.json", json.dumps(self.to_json(), indent=1, default=_plain, allow_nan=True))
-        write_atomically(out / "report.html", render(self))
+        write_atomically(out / "report.json", data + "\n")
+        write_atomically(out / "report.html", page)
         return out
 
 
 def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+    """The same in types of strict JSON, which knows no NaN and no infinity."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, str | int) else str(value)
 
 
 def write_atomically(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -176,7 +176,9 @@ def learnable_share(residuals: list[ForceResidual], seed: int, features: int = 2
         fold.append((half + number) % 2)
     x, y, part = np.concatenate(inputs), np.concatenate(targets), np.concatenate(fold)
     x = (x - x.mean(0)) / (x.std(0) + 1e-9)
-    hidden = np.tanh(x @ rng.standard_normal((x.shape[1], features)) / np.sqrt(x.shape[1]) + rng.uniform(-1, 1, features))
+    hidden = np.tanh(
+        x @ rng.standard_normal((x.shape[1], features)) / np.sqrt(x.shape[1]) + rng.uniform(-1, 1, features)
+    )
     design = np.concatenate([np.ones((len(x), 1)), x, hidden], axis=1)
     left = np.zeros_like(y)
     for held in (0, 1):

@@ -44,7 +44,7 @@ def screen(problem: Problem, fit: Fit) -> Screening:
     simulation = problem.simulation
     strength = np.flatnonzero(simulation.strength)
     r, jt, jx = problem.linearise(fit.values, fit.starts, strength)
-    reduced = problem.reduce(r, jt, jx, fit.starts, clip=1e9)
+    reduced = problem.reduce(0 * r, jt, jx, fit.starts, clip=3.0)
     known = problem.declared[strength]
     c = np.flatnonzero(~known)
     perp = _orthogonal(reduced.normal.sum(0), known)
@@ -61,8 +61,8 @@ def screen(problem: Problem, fit: Fit) -> Screening:
     roots = [_inverse_root(even[np.ix_(g, g)]) if len(g) else np.zeros((0, 0)) for g in groups]
     for a in range(count):
         for b in range(a):
-            if len(groups[a]) and len(groups[b]):
-                canonical = np.linalg.svd(roots[a] @ even[np.ix_(groups[a], groups[b])] @ roots[b], compute_uv=False)
+            if len(roots[a]) and len(roots[b]):
+                canonical = np.linalg.svd(roots[a] @ even[np.ix_(groups[a], groups[b])] @ roots[b].T, compute_uv=False)
                 # The smaller group must lie in the larger one.
                 cosine[a, b] = cosine[b, a] = float(np.clip(canonical.min(), 0, 1))
     return Screening(sensitivity, cosine)

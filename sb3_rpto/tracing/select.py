@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from sb3_rpto.tracing.screen import Screening
 GAIN = 0.03
 #: Iterations of a refit that begins at the larger model's optimum.
 REFIT = 5
+#: Effects whose removal raises the cost by less than this share, to second order, may go together.
+TRIFLE = 0.01
 #: Candidates for a substitution are the likest so many.
 SUBSTITUTES = 5
 
@@ -109,8 +111,21 @@ class Selector:
 
     def free(self, effects: Sequence[int]) -> np.ndarray:
         """Indices of the parameters of the declared and of the given effects."""
-        keep = [s for i, s in enumerate(self.simulation.slices) if i in effects or self.simulation.effects[i].kind == "declared"]
-        return np.concatenate([np.arange(s.start, s.stop) for s in keep]).astype(int) if keep else np.empty(0, dtype=int)
+        keep = [
+            s
+            for i, s in enumerate(self.simulation.slices)
+            if i in effects or self.simulation.effects[i].kind == "declared"
+        ]
+        return (
+            np.concatenate([np.arange(s.start, s.stop) for s in keep]).astype(int) if keep else np.empty(0, dtype=int)
+        )
+
+    def together(self, effects: Sequence[int], base: Fit) -> Model:
+        """Fit all candidates at once: roughly on every third window, then on all."""
+        windows = self.train.windows
+        some = np.arange(0, len(windows), 3)
+        rough = self.train.on(some).fit(base.values, self.free(effects), base.starts[some], 15, tolerance=1e-2)
+        return self.model(effects, replace(base, values=rough.values))
 
     def model(self, effects: Sequence[int], begin: Fit, iterations: int = REFIT) -> Model:
         """Fit a model from the optimum of another, without the effects that it lacks."""
@@ -121,7 +136,7 @@ class Selector:
         for i, s in enumerate(self.simulation.slices):
             if i not in key and self.simulation.effects[i].kind != "declared":
                 values[s] = self.simulation.null[s]
-        fit = self.train.fit(values, self.free(key), begin.starts, iterations)
+        fit = self.train.fit(values, self.free(key), begin.starts, iterations, tolerance=3e-3)
         found = Model(key, fit, self.select.score(fit.values).errors)
         self._memory[key] = found
         return found
@@ -141,7 +156,7 @@ class Selector:
         while current.effects:
             step += 1
             order, costs = self.removal_costs(current)
-            trifles = [e for e in order if costs[e] < 0.002 * current.fit.cost]
+            trifles = [e for e in order if costs[e] < TRIFLE * current.fit.cost]
             reduced = None
             for drop in _bundles(order, trifles):
                 trial = self.model([e for e in current.effects if e not in drop], current.fit)
@@ -178,7 +193,9 @@ class Selector:
         current = selection.model
         for e in current.effects:
             others = [i for i in np.argsort(-screening.cosine[e]) if i != e and i not in current.effects]
-            others = [int(i) for i in others if screening.excited(int(i)) and screening.cosine[e, i] > 0.3][:SUBSTITUTES]
+            others = [int(i) for i in others if screening.excited(int(i)) and screening.cosine[e, i] > 0.3][
+                :SUBSTITUTES
+            ]
             best, alike = e, []
             for other in others:
                 self.say(f"{self.simulation.effects[e].kind} or {self.simulation.effects[other].kind}")
@@ -192,7 +209,11 @@ class Selector:
                         current, best = trial, other
             selection.alike[best] = sorted({e, *alike} - {best})
         selection.model = current
-        selection.alike = {e: [i for i in found if i not in current.effects] for e, found in selection.alike.items() if e in current.effects}
+        selection.alike = {
+            e: [i for i in found if i not in current.effects]
+            for e, found in selection.alike.items()
+            if e in current.effects
+        }
         return selection
 
     def _simpler(self, a: int, b: int) -> bool:
@@ -221,6 +242,8 @@ class Selector:
             return selection
         gains = self._promise(current, outside)
         for e in sorted(outside, key=lambda e: -gains[e])[:3]:
+            if gains[e] < GAIN * current.fit.cost:
+                break
             trial = self.model([*current.effects, e], current.fit, REFIT + 3)
             self.say(f"looking at {self.simulation.effects[e].kind} again")
             if self.evidence(trial, current).clear(self.threshold):
@@ -233,9 +256,13 @@ class Selector:
         """How much each effect could lower the cost, to second order."""
         free = self.free([*model.effects, *outside])
         free = free[self.simulation.strength[free] | (model.fit.values[free] != self.simulation.null[free])]
-        linear = self.train.linear(model.fit, free)
-        normal, gradient = linear.normal.sum(0), linear.gradient.sum(0)
-        known = np.flatnonzero(~np.isin(free, np.concatenate([np.arange(*_ends(self.simulation.slices[e])) for e in outside])))
+        some = np.arange(0, len(self.train.windows), 3)
+        linear = self.train.on(some).linear(replace(model.fit, starts=model.fit.starts[some]), free)
+        share = len(self.train.windows) / len(some)
+        normal, gradient = share * linear.normal.sum(0), share * linear.gradient.sum(0)
+        known = np.flatnonzero(
+            ~np.isin(free, np.concatenate([np.arange(*_ends(self.simulation.slices[e])) for e in outside]))
+        )
         gains = {}
         for e in outside:
             rows = np.flatnonzero(np.isin(free, np.arange(*_ends(self.simulation.slices[e]))))

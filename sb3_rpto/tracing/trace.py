@@ -137,7 +137,7 @@ def search(selector: Selector, base: Model, screening: Screening, say: Progress)
         if not any(j in chosen for j in screening.alike(i)):
             chosen.append(i)
     say(0.2, f"fitting {len(chosen)} candidates together")
-    full = selector.model(chosen, base.fit, iterations=20)
+    full = selector.together(chosen, base.fit)
     selection = selector.eliminate(full, base)
     selection = selector.add_back(selection, chosen)
     say(0.7, "trying like effects in their place")
@@ -193,7 +193,10 @@ def join(a: Windows, b: Windows) -> Windows:
 
     enabled = None
     if a.drive.enabled is not None or b.drive.enabled is not None:
-        parts = [w.drive.enabled if w.drive.enabled is not None else np.ones_like(w.drive.commands[:, w.drive.before :]) for w in (a, b)]
+        parts = [
+            w.drive.enabled if w.drive.enabled is not None else np.ones_like(w.drive.commands[:, w.drive.before :])
+            for w in (a, b)
+        ]
         enabled = np.concatenate(parts)
     drive = a.drive._replace(
         commands=np.concatenate([a.drive.commands, b.drive.commands]),
@@ -350,8 +353,10 @@ def _candidate(
         return Candidate(effect.label, "not excited", f"to see it: {effect.excite}", sensitivity, alike)
     if i in selection.dropped:
         step, evidence = selection.dropped[i]
-        why = "hardly matters in the joint fit" if evidence is None else (
-            f"removal costs {evidence.gain:+.1%} of the error (t = {evidence.t:.1f})"
+        why = (
+            "hardly matters in the joint fit"
+            if evidence is None
+            else (f"removal costs {evidence.gain:+.1%} of the error (t = {evidence.t:.1f})")
         )
         return Candidate(effect.label, "dropped", f"step {step}: {why}", sensitivity, alike)
     return Candidate(effect.label, "dropped", f"looks like {alike[0]}" if alike else "not fitted", sensitivity, alike)

@@ -1,0 +1,151 @@
+"""The words of a report: verdicts in plain language, names and units of a model's joints, equations with numbers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from sb3_rpto.effects import Declared, Effect
+from sb3_rpto.effects.actuation import drivers
+from sb3_rpto.effects.names import SCALAR_JOINTS, object_id, object_names
+
+#: For each verdict what it means, and what it does not mean.
+VERDICTS = {
+    "complete": (
+        "Nothing is missing: with its declared parameters fitted, the model predicts unseen windows as well as the "
+        "measurement noise allows.",
+        "This holds for motion like the recorded one. Effects that these data cannot show may still be there.",
+    ),
+    "explained": (
+        "The model lacked the effects below; with them, what is left is no more than the measurement noise.",
+        "Effects of one class act alike in these data: any of them may be the true one.",
+    ),
+    "partly explained": (
+        "The effects below take away at least half of the excess error, but something remains that no effect of the "
+        "library explains.",
+        "They bring the model closer to the data and are not claimed as the explanation.",
+    ),
+    "unexplained": (
+        "The model does not fit the data, and no effect of the library explains why.",
+        "Effects that are listed all the same lower the error and are not claimed as the explanation.",
+    ),
+}
+
+
+def unit_at(effect: Effect, unit: str, model: mujoco.MjModel) -> str:
+    """The unit of a parameter where an effect sits: units are stated for hinges, a slide has m for rad and N for N·m.
+
+    :param unit: as in :class:`~sb3_rpto.effects.effect.Parameter`
+    """
+    if isinstance(effect, Declared):
+        joint = effect.index if effect.owner == "joint" else -1
+    elif effect.place in ("joint", "sensor", "actuator"):
+        joint = _joint(effect, model)
+    else:
+        joint = -1
+    if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_SLIDE:
+        return unit
+    return unit.replace("kg·m²", "kg").replace("N·m", "N").replace("(N)", "N").replace("rad", "m")
+
+
+def _joint(effect: Effect, model: mujoco.MjModel) -> int:
+    """Id of the joint that an effect of a joint, a sensor or an actuator acts on; -1: none."""
+    if effect.place in ("joint", "sensor"):
+        return object_id(model, "joint", effect.on)
+    actuator = object_id(model, "actuator", effect.on)
+    joints = (j for j in range(model.njnt) if actuator in drivers(model, j))
+    return next(joints, -1)
+
+
+def dofs_of(effect: Effect, model: mujoco.MjModel) -> list[int]:
+    """Degrees of freedom of hinges and slides that an effect acts on: of its joint, of its body's chain, or all."""
+    scalar = scalar_dofs(model)
+    if effect.place in ("joint", "sensor", "actuator"):
+        joint = _joint(effect, model)
+        return [d for d in scalar if d == (model.jnt_dofadr[joint] if joint >= 0 else d)]
+    if effect.place not in ("body", "geom"):
+        return scalar
+    body = object_id(model, effect.place, effect.on)
+    body = int(model.geom_bodyid[body]) if effect.place == "geom" else body
+    chain = set()
+    while body:
+        chain.add(body)
+        body = int(model.body_parentid[body])
+    return [d for d in scalar if int(model.dof_bodyid[d]) in chain]
+
+
+def scalar_dofs(model: mujoco.MjModel) -> list[int]:
+    """Addresses in qvel of hinges and slides."""
+    return [int(model.jnt_dofadr[j]) for j in range(model.njnt) if model.jnt_type[j] in SCALAR_JOINTS]
+
+
+def dof_name(model: mujoco.MjModel, dof: int) -> str:
+    """Name of the joint of a degree of freedom."""
+    return object_names(model, "joint")[model.dof_jntid[dof]]
+
+
+def dof_unit(model: mujoco.MjModel, dof: int) -> str:
+    """rad or m."""
+    return "m" if model.jnt_type[model.dof_jntid[dof]] == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+
+
+def force_unit(model: mujoco.MjModel, dof: int) -> str:
+    """N·m or N."""
+    return "N" if dof_unit(model, dof) == "m" else "N·m"
+
+
+def position_unit(model: mujoco.MjModel, column: str) -> str:
+    """Unit of a position column; none for a coordinate of a quaternion."""
+    joints = object_names(model, "joint")
+    if column in joints:
+        return dof_unit(model, int(model.jnt_dofadr[joints.index(column)]))
+    joint, _, offset = column.rpartition(".")
+    free = joint in joints and model.jnt_type[joints.index(joint)] == mujoco.mjtJoint.mjJNT_FREE
+    return "m" if free and int(offset) < 3 else ""
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number for people; a dash where there is none."""
+    return f"{value:.{digits}g}" if np.isfinite(value) else "–"
+
+
+def interval(low: float, high: float, digits: int = 4) -> str:
+    """``[low, high]``."""
+    return f"[{number(low, digits)}, {number(high, digits)}]"
+
+
+def with_numbers(effect: Effect) -> str:
+    """The effect's equation with its values in place of the parameters' names."""
+    text = effect.equation
+    if effect.place not in ("joint", "actuator", "sensor"):
+        return text  # in words, whose words may be names of parameters
+    for p, value in zip(effect.parameters, effect.values):
+        shown = number(value) if value >= 0 else f"({number(value)})"
+        text = re.sub(rf"\b{re.escape(p.name)}\b", shown, text)
+    return re.sub(r"^\((-[^() ]+)\)", r"\1", text)
+
+
+def equation(effects: Sequence[Effect]) -> str:
+    """The corrected model in a line: forces as terms of the equation of motion, all else after it."""
+    terms = ["M(q) qdd + c(q, qd) = tau + passive(q, qd)"]
+    others: list[str] = []
+    for effect in effects:
+        at = f"[{effect.on}] " if effect.on else ""
+        (terms if effect.place == "joint" else others).append(f"{at}{with_numbers(effect)}")
+    return "; ".join([" + ".join(terms), *others])
+
+
+def percent(share: float) -> str:
+    """A share in per cent."""
+    return f"{100 * share:.0f} %" if np.isfinite(share) else "–"
+
+
+def aligned(rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
+    """Lines of a table whose columns stand under each other."""
+    if not rows:
+        return []
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [indent + "  ".join(cell.ljust(w) for cell, w in zip(row, widths)).rstrip() for row in rows]
