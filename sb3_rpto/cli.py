@@ -1,0 +1,235 @@
+"""The command ``sb3-rpto``: a thin shell over the package."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from sb3_rpto.version import __version__
+
+if TYPE_CHECKING:
+    from sb3_rpto.tracing import Measurements
+
+#: Exit codes: bad input, and interrupted by the user.
+BAD_INPUT, INTERRUPTED = 2, 130
+#: What users can cause. Anything else is an error of ours and keeps its traceback.
+USER_ERRORS = (ValueError, TypeError, OSError, ImportError)
+#: Readers of recordings by the suffix of their files.
+FORMATS = {"csv": "from_csv", "parquet": "from_parquet", "npz": "from_npz"}
+#: Modules with ``main(arguments) -> exit code`` behind ``sb3-rpto benchmark NAME``.
+BENCHMARKS = {"tracing": "sb3_rpto.experiments.tracing_benchmark"}
+
+Commands = Any  # argparse's own type for a group of subcommands is private
+
+
+class _Parser(argparse.ArgumentParser):
+    """One line for a wrong argument, as for all bad input."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f"{message}; see '{self.prog} --help'")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    :param arguments: without the program's name; default: those of the process
+    :return: exit code: 0 done, 2 bad input (with one line on stderr), 130 interrupted
+    """
+    parser = _Parser(prog="sb3-rpto", description="Move policies from a simulator to a target, and say what it lacks.")
+    parser.add_argument("--version", action="version", version=f"sb3-rpto {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for add in (_add_trace, _add_benchmark):
+        add(commands)
+    try:
+        parsed = parser.parse_args(arguments)
+        run: Callable[[argparse.Namespace], int] = parsed.run
+        return run(parsed)
+    except KeyboardInterrupt:
+        print("sb3-rpto: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except USER_ERRORS as error:
+        print(f"sb3-rpto: error: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
+        return BAD_INPUT
+
+
+# --- trace ----------------------------------------------------------------------------------------------------------
+
+TRACE = """\
+Say which effect a simulator lacks to explain recordings of a machine.
+
+The declared parameters of the model are fitted to the recordings first. Where the
+fitted model still errs by more than the measurement noise, friction, delays, offsets
+and some twenty other effects are tried at all joints and motors. The verdict is
+complete, explained, partly explained or unexplained.
+"""
+
+TRACE_EXAMPLE = """\
+example:
+  sb3-rpto trace robot.xml 'runs/*.csv' --declare hinge.damping,pole.mass --out out/
+
+writes out/report.html to read, out/report.json for programs, and the corrected
+simulator: out/model.xml, which MuJoCo loads, with out/effects.json beside it.
+
+recordings, one row a sample, SI units, named as in the MJCF:
+  episode,time,qpos.hinge,qvel.hinge,ctrl.motor
+qvel may be missing. More on the format: docs/measurements.md
+"""
+
+
+def _add_trace(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "trace",
+        help="say from recordings what a simulator lacks, and correct it",
+        description=TRACE,
+        epilog=TRACE_EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("model", metavar="MODEL", help="MJCF file, or gymnasium id (Reacher-v5, package:name/Task-v0)")
+    parser.add_argument("files", metavar="FILES", nargs="+", help="recordings: .csv, .csv.gz, .parquet or .npz")
+    parser.add_argument("--out", metavar="DIR", required=True, type=Path, help="folder for the report and the model")
+    parser.add_argument(
+        "--declare",
+        metavar="A,B",
+        type=_names,
+        action="extend",
+        default=[],
+        help="parameters that may be fitted: hinge.damping, pole.mass, '*.damping', arm.mass=0.2:0.9; repeatable",
+    )
+    parser.add_argument(
+        "--candidates", metavar="K1,K2", type=_names, help="kinds of effects to look for (default: all in the library)"
+    )
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the split and the resampling (default: 0)")
+    parser.add_argument("--horizon", metavar="S", type=float, help="length of a prediction window in s (default: 0.5)")
+    parser.add_argument(
+        "--calibrate",
+        metavar="N",
+        type=int,
+        default=0,
+        help="set the threshold from N data sets simulated from the fitted model (slow; default: as shipped)",
+    )
+    parser.add_argument("--format", choices=sorted(FORMATS), help="of the recordings (default: by their suffix)")
+    parser.add_argument("--quiet", action="store_true", help="no progress; print the verdict alone")
+    parser.set_defaults(run=_trace)
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _trace(parsed: argparse.Namespace) -> int:
+    from sb3_rpto.tracing import figures, trace
+
+    # What would fail at the end fails now, before minutes of work.
+    figures.require()
+    if parsed.horizon is not None and not parsed.horizon > 0:
+        raise ValueError(f"--horizon is {parsed.horizon:g}; give a time in s above 0")
+    if parsed.calibrate < 0:
+        raise ValueError(f"--calibrate is {parsed.calibrate}; give a number of data sets, or 0 for none")
+    model = _model(parsed.model)
+    data = _recordings(parsed.files, parsed.format)
+    parsed.out.mkdir(parents=True, exist_ok=True)
+    with _progress(parsed.quiet) as progress:
+        report = trace(
+            model,
+            data,
+            parsed.declare,
+            seed=parsed.seed,
+            candidates=parsed.candidates,
+            horizon=parsed.horizon,
+            calibrate=parsed.calibrate,
+            progress=progress,
+        )
+    report.save(parsed.out)
+    print(report.verdict if parsed.quiet else f"{report}\n\nwritten: {parsed.out / 'report.html'}")
+    return 0
+
+
+def _model(name: str) -> Any:
+    """The path of an MJCF file, or the environment of a gymnasium id."""
+    if Path(name).is_file():
+        return name
+    if Path(name).suffix in (".xml", ".mjcf", ".urdf"):
+        raise FileNotFoundError(f"there is no MJCF file {name!r}; check the path")
+    import gymnasium as gym
+
+    try:
+        return gym.make(name)
+    except (gym.error.Error, ModuleNotFoundError) as error:
+        raise ValueError(f"MODEL {name!r} is neither a file nor a gymnasium environment: {error}") from error
+
+
+def _recordings(files: Sequence[str], form: str | None) -> Measurements:
+    """Read files of one format."""
+    from sb3_rpto.tracing import Measurements
+
+    found = {form} if form else {_format_of(file) for file in files}
+    if len(found) > 1:
+        raise ValueError(f"FILES are of several formats ({', '.join(sorted(map(str, found)))}); convert them to one")
+    return getattr(Measurements, FORMATS[str(found.pop())])(files)
+
+
+def _format_of(file: str) -> str:
+    suffix = Path(file.removesuffix(".gz")).suffix.removeprefix(".").lower()
+    if suffix not in FORMATS:
+        raise ValueError(f"{file}: recordings are .csv, .csv.gz, .parquet or .npz; name another suffix's by --format")
+    return suffix
+
+
+@contextlib.contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[float, str], None] | None]:
+    """A bar where there is a terminal and rich, else a line for each thing that is done."""
+    if quiet:
+        yield None
+        return
+    try:
+        from rich.console import Console
+        from rich.progress import Progress
+    except ImportError:
+        yield _lines()
+        return
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines()
+        return
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("reading", total=1.0)
+        yield lambda share, what: bar.update(task, completed=share, description=what)
+
+
+def _lines() -> Callable[[float, str], None]:
+    last = [""]
+
+    def say(share: float, what: str) -> None:
+        if what != last[0]:
+            print(f"[{share:4.0%}] {what}", file=sys.stderr)
+        last[0] = what
+
+    return say
+
+
+# --- benchmark ------------------------------------------------------------------------------------------------------
+
+
+def _add_benchmark(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "benchmark",
+        help="measure how well the package does, and make the committed tables",
+        epilog="'sb3-rpto benchmark NAME --help' lists the options of each.",
+    )
+    parser.add_argument("name", metavar="NAME", choices=sorted(BENCHMARKS), help=f"one of: {', '.join(BENCHMARKS)}")
+    parser.add_argument("options", metavar="...", nargs=argparse.REMAINDER, help="passed on to the benchmark")
+    parser.set_defaults(run=_benchmark)
+
+
+def _benchmark(parsed: argparse.Namespace) -> int:
+    module = importlib.import_module(BENCHMARKS[parsed.name])
+    return int(module.main(parsed.options) or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

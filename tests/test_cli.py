@@ -1,0 +1,162 @@
+"""The command sb3-rpto: exit codes, messages, and what it writes."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import pytest
+
+from sb3_rpto import __version__, cli
+from sb3_rpto.experiments.planting import generate
+from sb3_rpto.tracing import wording
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with robot.xml, runs.csv and wrong ones."""
+    folder = tmp_path_factory.mktemp("machine")
+    planted = generate("pendulum", [("coulomb_friction", "large")], seed=0, episodes=4, duration=1.5)
+    (folder / "robot.xml").write_text(planted.xml)
+    table = planted.measurements.tables()
+    for name, drop in (("runs.csv", ()), ("unknown.csv", ("qpos.hinge",))):
+        columns = {("qpos.elbow" if c in drop else c): v for c, v in table.items()}
+        with (folder / name).open("w", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(columns)
+            writer.writerows(zip(*columns.values()))
+    (folder / "broken.xml").write_text("<mujoco><worldbody></mujoco>")
+    return folder
+
+
+def run(files: Path, *options: str, model: str = "robot.xml", data: str = "runs.csv") -> int:
+    given = [str(files / model) if model.endswith(".xml") else model, str(files / data)]
+    return cli.main(["trace", *given, "--out", str(files / "out"), "--candidates", "coulomb_friction", *options])
+
+
+def error(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line on stderr."""
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.splitlines()
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("sb3-rpto: error: ")
+    return lines[0]
+
+
+def test_trace_prints_the_report_and_writes_the_folder(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(files, "--declare", "pole.mass", "--declare", "hinge.damping", "--seed", "1") == 0
+    captured = capsys.readouterr()
+    found = json.loads((files / "out" / "report.json").read_text(encoding="utf-8"))
+    assert captured.out.startswith(f"verdict: {found['verdict']}\n")
+    assert "report.html" in captured.out.splitlines()[-1]
+    assert "fitting the declared parameters" in captured.err
+    assert [d["label"] for d in found["declared"]] == ["pole.mass", "hinge.damping"]
+    assert {c["label"] for c in found["candidates"]} == {"coulomb_friction(hinge)"}
+    assert found["seed"] == 1
+    assert (files / "out" / "model.xml").is_file()
+
+
+def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(files, "--quiet", "--format", "csv", "--horizon", "0.3") == 0
+    captured = capsys.readouterr()
+    assert captured.out.strip() in wording.VERDICTS
+    assert captured.err == ""
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"data": "absent.csv"}, "no file matches"),
+        ({"data": "runs.mat"}, "--format"),
+        ({"data": "unknown.csv"}, "has no 'qpos.hinge'"),
+        ({"model": "absent.xml"}, "there is no MJCF file"),
+        ({"model": "broken.xml"}, "broken.xml"),
+        ({"model": "Nothing-v7"}, "neither a file nor a gymnasium environment"),
+        ({"model": "no_such_package:Nothing-v7"}, "neither a file nor a gymnasium environment"),
+        ({"model": "CartPole-v1"}, "no MuJoCo model"),
+        ({"options": ["--declare", "hinge.dampng"]}, "damping"),
+        ({"options": ["--candidates", "friction"]}, "coulomb_friction"),
+        ({"options": ["--horizon", "-1"]}, "--horizon"),
+        ({"options": ["--calibrate", "-1"]}, "--calibrate"),
+        ({"options": ["--seed", "one"]}, "sb3-rpto trace --help"),
+    ],
+)
+def test_bad_input_is_one_line_that_names_the_remedy(
+    files: Path, given: dict, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(files, *given.pop("options", ()), "--quiet", **given) == 2
+    assert message in error(capsys)
+
+
+def test_a_gymnasium_id_names_a_model() -> None:
+    env = cli._model("InvertedPendulum-v5")
+    assert isinstance(env.unwrapped.model, mujoco.MjModel)
+    assert cli._model("sb3_rpto:InvertedPendulum-v5").spec.id == "InvertedPendulum-v5"
+
+
+def test_files_of_several_formats_are_refused(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["trace", str(files / "robot.xml"), "a.csv", "b.npz", "--out", str(files / "out")]
+    assert cli.main(arguments) == 2
+    assert "csv, npz" in error(capsys)
+
+
+def test_an_output_that_cannot_be_a_folder_fails_before_the_work(
+    files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(files, "--out", str(files / "runs.csv")) == 2
+    assert "runs.csv" in error(capsys)
+
+
+def test_without_matplotlib_nothing_is_started(
+    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert run(files) == 2
+    assert "sb3-rpto[tracing]" in error(capsys)
+
+
+def test_interrupt_gives_130(files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_recordings", interrupted)
+    assert run(files) == 130
+    assert capsys.readouterr().err == "sb3-rpto: interrupted\n"
+
+
+def test_no_command_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 2
+    assert "--help" in error(capsys)
+
+
+def test_options_of_a_benchmark_are_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = type(sys)("fake_benchmark")
+    module.main = lambda options: len(options)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "fake_benchmark", module)
+    monkeypatch.setitem(cli.BENCHMARKS, "tracing", "fake_benchmark")
+    assert cli.main(["benchmark", "tracing", "--help", "-x", "1"]) == 3
+
+
+@pytest.mark.parametrize(("command", "words"), [([], "trace"), (["trace"], "example:"), (["benchmark"], "tracing")])
+def test_help_exits_with_0(command: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        cli.main([*command, "--help"])
+    assert words in capsys.readouterr().out
+
+
+def test_as_a_process(files: Path) -> None:
+    arguments = ["trace", str(files / "absent.xml"), str(files / "runs.csv"), "--out", str(files / "out")]
+    done = subprocess.run([sys.executable, "-m", "sb3_rpto.cli", *arguments], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("sb3-rpto: error: there is no MJCF file")
+    assert "Traceback" not in done.stderr
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        cli.main(["--version"])
+    assert capsys.readouterr().out == f"sb3-rpto {__version__}\n"
