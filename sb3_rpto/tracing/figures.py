@@ -11,18 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_rpto.effects import Effect
-from sb3_rpto.effects.names import object_id
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.evaluate import HorizonError, predictions
-from sb3_rpto.tracing.residuals import REST, ForceResidual
 from sb3_rpto.tracing.windows import cut
 
 if TYPE_CHECKING:
     from sb3_rpto.tracing.report import Report
 
 # Apart for readers with any colour vision, and in grey (Okabe & Ito 2008); lines and markers differ as well.
-BEFORE, AFTER, MEASURED = "#D55E00", "#0072B2", "#444444"
+BEFORE, AFTER, WITHOUT, MEASURED = "#D55E00", "#0072B2", "#009E73", "#444444"
 STYLE: Any = {
     "svg.fonttype": "path",
     "svg.hashsalt": "sb3-rpto",
@@ -36,35 +33,8 @@ STYLE: Any = {
     "legend.frameon": False,
     "legend.fontsize": 8,
 }
-#: Most points of a scatter, windows to choose from, and joints in a figure.
-POINTS, WINDOWS, JOINTS = 1200, 100, 8
-BINS = 15
-
-#: What an effect answers to, where its place alone does not say it.
-CAUSES = {
-    "spring": "position",
-    "torque_ripple": "position",
-    "position_friction": "position",
-    "load_friction": "load",
-    "directional_load_friction": "load",
-    "torque_offset": "time",
-    "armature": "acceleration",
-    "command_delay": "command rate",
-    "actuator_lag": "command rate",
-    "dc_motor": "velocity",
-    "wind": "velocity",
-    "fluid": "velocity",
-}
-BY_PLACE = {
-    "joint": "velocity",
-    "actuator": "command",
-    "sensor": "position",
-    "body": "position",
-    "geom": "velocity",
-    "world": "position",
-}
-#: Frictions whose level is shown: their sign is that of the motion.
-LEVELS = ("position_friction", "load_friction", "directional_load_friction")
+#: Most windows to choose from, and joints in a figure.
+WINDOWS, JOINTS = 100, 8
 
 
 @dataclass(frozen=True)
@@ -125,7 +95,7 @@ def errors_by_horizon(report: Report) -> Picture | None:
         return None
     model = report.simulation.model
     joints = report.before[0].joints
-    shown = _largest(np.nan_to_num(report.before[0].rmse))
+    shown = largest(np.nan_to_num(report.before[0].rmse))
     floors = {f.horizon: f for f in report.floor}
     x = np.arange(len(report.before))
     columns = min(len(shown), 2)
@@ -168,7 +138,7 @@ def errors_by_horizon(report: Report) -> Picture | None:
         "95 % intervals by resampling blocks of windows, for whole runs the range of the runs. The dotted line is the "
         "error that a true model would still have, because starts and measurements are noisy."
     )
-    caption += _left_out(len(joints), len(shown))
+    caption += left_out(len(joints), len(shown))
     at = _middle(report.before)
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = float(np.exp(np.nanmean(np.log(report.before[at].rmse / report.after[at].rmse))))
@@ -190,160 +160,14 @@ def _middle(errors: Sequence[HorizonError]) -> int:
     return next((i for i, e in enumerate(errors) if e.horizon == 0.5), 0)
 
 
-def _largest(sizes: np.ndarray) -> list[int]:
+def largest(sizes: np.ndarray) -> list[int]:
+    """Indices of the few joints that are worth a panel."""
     return sorted(np.argsort(-np.asarray(sizes))[:JOINTS].tolist())
 
 
-def _left_out(total: int, shown: int) -> str:
+def left_out(total: int, shown: int) -> str:
+    """A sentence for a caption where not all joints are shown."""
     return f" The {shown} joints with the largest errors of {total} are shown." if shown < total else ""
-
-
-# --- force residual against its cause -------------------------------------------------------------------------------
-
-
-def cause_of(effect: Effect) -> str:
-    """What an effect answers to: velocity, position, load, command, command rate, acceleration or time."""
-    return CAUSES.get(effect.kind, BY_PLACE[effect.place])
-
-
-def residual_of(report: Report, effect: Effect) -> Picture | None:
-    """The force residual before and after against the natural cause of an effect, at the joint that it moves most."""
-    model = report.simulation.model
-    dofs = wording.dofs_of(effect, model)
-    if not dofs or not report.residuals_before:
-        return None
-    dof = max(dofs, key=lambda d: report.force_before[d] - report.force_after[d])
-    cause, level = cause_of(effect), effect.kind in LEVELS
-    actuator = object_id(model, "actuator", effect.on) if effect.place == "actuator" else None
-
-    def paint(axes: np.ndarray) -> None:
-        everything = []
-        for axis, residuals, name, colour in (
-            (axes[0, 0], report.residuals_before, "before", BEFORE),
-            (axes[0, 1], report.residuals_after, "after", AFTER),
-        ):
-            everything.append(_residual(axis, residuals, model, dof, cause, colour, actuator, level))
-            rms = (report.force_before if name == "before" else report.force_after)[dof]
-            axis.set_title(f"{name} the correction: {rms:.3g} {wording.force_unit(model, dof)} RMS")
-        low, high = np.min([e[0] for e in everything]), np.max([e[1] for e in everything])
-        for axis in axes[0]:
-            axis.set_ylim(low, high)
-
-    sign = " times the direction of motion (negative: it brakes)" if level else ""
-    caption = (
-        f"Each dot is one sample of the {_kind_of_runs(report)} runs: the force that the motion needed and the model "
-        f"does not know{sign}, by inverse dynamics. The line joins medians. A line that changes with {cause} shows "
-        "what the model lacks; a flat line at zero, that it lacks nothing. For the eye only: decisions are made on "
-        "predictions."
-    )
-    title = (
-        f"{effect.label}: missing force of {wording.dof_name(model, dof)} against {cause}, RMS "
-        f"{report.force_before[dof]:.3g} → {report.force_after[dof]:.3g} {wording.force_unit(model, dof)}"
-    )
-    return Picture(title, draw(1, 2, paint), caption)
-
-
-def standard_residuals(report: Report) -> Picture | None:
-    """The force residual of the final model against velocity, position, load and command, joint by joint."""
-    model = report.simulation.model
-    dofs = wording.scalar_dofs(model)
-    if not dofs or not report.residuals_after:
-        return None
-    shown = [dofs[i] for i in _largest(report.force_after[dofs])]
-    causes = ["velocity", "position", "load", *(["command"] if model.nu else [])]
-
-    def paint(axes: np.ndarray) -> None:
-        for row, dof in zip(axes, shown):
-            for axis, cause in zip(row, causes):
-                bounds = _residual(axis, report.residuals_after, model, dof, cause, AFTER, None, False)
-                axis.set_ylim(*bounds)
-                axis.set_title(f"{wording.dof_name(model, dof)}: against {cause}")
-
-    caption = (
-        f"Each dot is one sample of the {_kind_of_runs(report)} runs: the force that the motion needed and the fitted "
-        "model does not know, by inverse dynamics. The line joins medians: flat at zero where the model lacks nothing "
-        "that depends on the axis below. Noise of differentiated positions spreads the dots. For the eye only."
-    )
-    caption += _left_out(len(dofs), len(shown))
-    return Picture("Missing force against four possible causes", draw(len(shown), len(causes), paint), caption)
-
-
-def _residual(
-    axis: Any,
-    residuals: Sequence[ForceResidual],
-    model: Any,
-    dof: int,
-    cause: str,
-    colour: str,
-    actuator: int | None,
-    level: bool,
-) -> tuple[float, float]:
-    """Scatter and binned medians; returns the range of forces to show."""
-    x = np.concatenate([_cause(r, dof, cause, _actuator(model, dof, actuator)) for r in residuals])
-    y = np.concatenate([r.force[:, dof] for r in residuals])
-    speed = np.concatenate([r.qvel[:, dof] for r in residuals])
-    if level:
-        # At rest dry friction has no known sign.
-        moving = np.abs(speed) > REST * np.quantile(np.abs(speed), 0.95)
-        x, y = x[moving], (y * np.sign(speed))[moving]
-    if not len(x):
-        return -1.0, 1.0
-    some = np.linspace(0, len(x) - 1, min(POINTS, len(x))).astype(int)
-    axis.axhline(0, color="black", linewidth=0.8)
-    if not np.ptp(x):
-        axis.text(0.5, 0.85, f"no {cause} here", ha="center", transform=axis.transAxes)
-    axis.plot(x[some], y[some], ".", color=colour, markersize=2.5, alpha=0.35, rasterized=True)
-    axis.plot(*binned_medians(x, y), "-o", color="black", markersize=3, linewidth=1.3, label="medians")
-    low, high = np.quantile(x, [0.005, 0.995])
-    margin = 0.02 * (high - low) or 1.0
-    axis.set_xlim(low - margin, high + margin)
-    axis.set_xlabel(f"{cause} [{_unit(model, dof, cause)}]")
-    axis.set_ylabel(f"missing force [{wording.force_unit(model, dof)}]")
-    below, above = np.quantile(y, [0.01, 0.99])
-    margin = 0.15 * (above - below) + 1e-9
-    return float(min(below, 0) - margin), float(max(above, 0) + margin)
-
-
-def _actuator(model: Any, dof: int, given: int | None) -> int:
-    """The actuator whose command is shown: the given one, one at the joint, or the first."""
-    if given is not None:
-        return given
-    at = [a for a in range(model.nu) if model.actuator_trnid[a, 0] == model.dof_jntid[dof]]
-    return at[0] if at else 0
-
-
-def _cause(r: ForceResidual, dof: int, cause: str, actuator: int) -> np.ndarray:
-    if cause == "time":
-        return r.time
-    if cause in ("command", "command rate"):
-        command = r.command[:, actuator]
-        return command if cause == "command" else np.gradient(command, r.time)
-    if cause == "acceleration":
-        return np.gradient(r.qvel[:, dof], r.time)
-    return {"position": r.qpos, "velocity": r.qvel, "load": r.load}[cause][:, dof]
-
-
-def _unit(model: Any, dof: int, cause: str) -> str:
-    unit = wording.dof_unit(model, dof)
-    return {
-        "time": "s",
-        "position": unit,
-        "velocity": f"{unit}/s",
-        "acceleration": f"{unit}/s²",
-        "load": wording.force_unit(model, dof),
-        "command": "its unit",
-        "command rate": "its unit/s",
-    }[cause]
-
-
-def binned_medians(x: np.ndarray, y: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
-    """Medians of ``y`` in bins of equal width over the central 99 % of ``x``; bins with few samples are left out."""
-    low, high = np.quantile(x, [0.005, 0.995])
-    edges = np.linspace(low, high + 1e-12, bins + 1)
-    number = np.digitize(x, edges) - 1
-    full = [b for b in range(bins) if (number == b).sum() >= max(5, len(x) // (20 * bins))]
-    centre = (edges[:-1] + edges[1:]) / 2
-    return centre[full], np.array([np.median(y[number == b]) for b in full])
 
 
 # --- predicted and measured -----------------------------------------------------------------------------------------
@@ -364,7 +188,7 @@ def trajectories(report: Report) -> Picture | None:
     order = np.argsort((off["after"] / windows.sigma).max(axis=1))
     chosen = list(dict.fromkeys(int(order[round(at * (len(order) - 1))]) for at in (0.35, 0.65, 1.0)))
     names = [n for n in data.columns.qpos if n not in data.unobserved]
-    shown = _largest(off["before"].mean(0) / windows.sigma)
+    shown = largest(off["before"].mean(0) / windows.sigma)
     step = float(simulation.model.opt.timestep)
 
     def paint(axes: np.ndarray) -> None:
@@ -386,14 +210,15 @@ def trajectories(report: Report) -> Picture | None:
         axes[0, 0].legend()
 
     caption = (
-        f"Windows of {report.horizon:g} s of the {_kind_of_runs(report)} runs: dots are measured, the dashed line is "
+        f"Windows of {report.horizon:g} s of the {kind_of_runs(report)} runs: dots are measured, the dashed line is "
         "the fitted model before the correction, the solid line after it. Two windows of typical error after the "
         "correction, and the worst one. Above each: RMSE before → after."
     )
-    caption += _left_out(len(names), len(shown))
+    caption += left_out(len(names), len(shown))
     title = "Predicted and measured motion in typical windows and in the worst"
     return Picture(title, draw(len(shown), len(chosen), paint, 2.2), caption)
 
 
-def _kind_of_runs(report: Report) -> str:
+def kind_of_runs(report: Report) -> str:
+    """Which runs the figures show."""
     return "test" if report.runs["test"] else "fitted"

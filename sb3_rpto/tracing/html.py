@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from sb3_rpto.effects import Declared
 from sb3_rpto.effects.carry import carried_by
-from sb3_rpto.tracing import figures, wording
+from sb3_rpto.tracing import causes, figures, wording
 from sb3_rpto.tracing.figures import Picture, horizon_label
 from sb3_rpto.version import __version__
 
@@ -208,10 +208,10 @@ def _forces(report: Report) -> str:
             "a learned correction could still take away."
         ),
     ]
-    shown = [figures.residual_of(report, t.effect) for t in report.effects[:FIGURES]]
+    shown = [causes.residual_of(report, t.effect) for t in report.effects[:FIGURES]]
     if len(report.effects) > FIGURES:
         lines.append(_note(f"The first {FIGURES} of {len(report.effects)} effects are drawn."))
-    lines += map(_picture, shown if report.effects else [figures.standard_residuals(report)])
+    lines += map(_picture, shown if report.effects else [causes.standard_residuals(report)])
     return "\n".join(lines)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.effects.effect import LIBRARY
-from sb3_rpto.tracing import Finding, Report, figures, wording
+from sb3_rpto.tracing import Finding, Report, causes, figures, wording
 from sb3_rpto.tracing.html import render
 from sb3_rpto.tracing.report import Candidate
 
@@ -112,7 +112,8 @@ def test_every_section_and_the_verdict_are_there(page: str, report: Report) -> N
 
 @pytest.mark.parametrize("verdict", ["explained", "partly explained", "unexplained"])
 def test_only_an_explanation_is_claimed(report: Report, verdict: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figures, "draw", lambda *_: "data:image/svg+xml;base64,")
+    for module in (causes, figures):
+        monkeypatch.setattr(module, "draw", lambda *_: "data:image/svg+xml;base64,")
     words = "".join(Reader(render(replace(report, verdict=verdict))).words)
     assert ("not claimed as the explanation" in words) == (verdict != "explained")
 
@@ -122,7 +123,8 @@ def test_the_same_report_gives_the_same_page(page: str, report: Report) -> None:
 
 
 def test_names_of_users_cannot_break_the_page(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figures, "draw", lambda *_: "data:image/svg+xml;base64,")
+    for module in (causes, figures):
+        monkeypatch.setattr(module, "draw", lambda *_: "data:image/svg+xml;base64,")
     evil = '<script>alert("x")</script>&'
     other = replace(
         report,
@@ -153,25 +155,36 @@ def test_without_effects_four_causes_are_shown(report: Report) -> None:
 
 
 def test_without_test_runs_the_page_says_so(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figures, "draw", lambda *_: "data:image/svg+xml;base64,")
+    for module in (causes, figures):
+        monkeypatch.setattr(module, "draw", lambda *_: "data:image/svg+xml;base64,")
     other = replace(report, runs={**report.runs, "test": []})
     assert "There are no test runs" in "".join(Reader(render(other)).words)
     assert "no test runs" in str(other)
 
 
+def test_without_this_effect_alone_its_own_force_is_what_is_missing(report: Report) -> None:
+    (found,) = report.effects
+    without = causes._without(report, found.effect)
+    speed = np.concatenate([r.qvel[:, 0] for r in without])
+    force = np.concatenate([r.force[:, 0] for r in without])
+    for sign in (-1, 1):
+        median = np.median(force[sign * speed > 1.0])
+        assert median == pytest.approx(-sign * found.effect.values[0], rel=0.15)
+
+
 def test_medians_follow_the_data() -> None:
     x = np.linspace(-1, 1, 4001)
     noise = np.random.default_rng(0).standard_cauchy(len(x)) * 0.01
-    centre, median = figures.binned_medians(x, np.sign(x) + noise)
+    centre, median = causes.binned_medians(x, np.sign(x) + noise)
     away = np.abs(centre) > 0.1
     np.testing.assert_allclose(median[away], np.sign(centre[away]), atol=0.01)
 
 
 def test_every_effect_of_the_library_has_a_cause() -> None:
     for kind, effect in LIBRARY.items():
-        assert effect.place in figures.BY_PLACE, kind
-    assert set(figures.CAUSES) <= set(LIBRARY)
-    assert set(figures.LEVELS) <= set(figures.CAUSES)
+        assert effect.place in causes.BY_PLACE, kind
+    assert set(causes.CAUSES) <= set(LIBRARY)
+    assert set(causes.LEVELS) <= set(causes.CAUSES)
 
 
 def test_without_matplotlib_the_extra_is_named(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
