@@ -1,0 +1,301 @@
+"""Windows of multiple shooting: noise, smoothed starts, and what is cut where."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from simulated import PENDULUM, compiled, recorded
+
+from sb3_rpto.effects.names import object_id
+from sb3_rpto.tracing import Measurements
+from sb3_rpto.tracing.episodes import Episode
+from sb3_rpto.tracing.windows import EXACT, cut, noise_levels, smoothed_state, time_step
+
+SIGMA = np.array([1e-3])
+
+
+def clock(samples: int, rate: float = 200.0, jitter: float = 0.0, seed: int = 0) -> np.ndarray:
+    return (np.arange(samples) + jitter * np.random.default_rng(seed).uniform(-0.5, 0.5, samples)) / rate
+
+
+def measured(times: list[np.ndarray], q: list[np.ndarray], **columns) -> Measurements:
+    """One table for each episode; ``columns`` are lists of arrays, too."""
+    tables = {}
+    for i, (t, position) in enumerate(zip(times, q)):
+        tables[f"run{i}"] = {"time": t, "qpos.hinge": position, "ctrl.motor": np.zeros(len(t))} | {
+            name: np.broadcast_to(values[i], len(t)) for name, values in columns.items()
+        }
+    return Measurements.from_tables(tables)
+
+
+def swings(jitter: float = 0.0, noise: float = 0.0, quantum: float = 0.0, seed: int = 0) -> Measurements:
+    """Five runs of sums of sinusoids up to 2 Hz."""
+    rng = np.random.default_rng(seed)
+    times = [clock(500, 200.0, jitter, i) for i in range(5)]
+    q = []
+    for t in times:
+        a, f, p = rng.uniform(0.2, 0.6, 4), rng.uniform(0.2, 2.0, 4), rng.uniform(0, 6, 4)
+        path = (a * np.sin(2 * np.pi * f * t[:, None] + p)).sum(1) + noise * rng.standard_normal(len(t))
+        q.append(quantum * np.round(path / quantum) if quantum else path)
+    return measured(times, q)
+
+
+def ramps(times: list[np.ndarray], **columns) -> Measurements:
+    """Runs whose position and command tell the time: q = t, u = t."""
+    q = [t.copy() for t in times]
+    return measured(times, q, **({"ctrl.motor": q, "qvel.hinge": [np.ones(1)] * len(q)} | columns))
+
+
+# --- noise ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", [1e-3, 5e-3])
+@pytest.mark.parametrize("jitter", [0.0, 0.6])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_white_noise_is_found_on_smooth_motion_on_any_clock(noise: float, jitter: float, seed: int) -> None:
+    assert noise_levels(swings(jitter, noise, seed=seed)) == pytest.approx([noise], rel=0.1)
+
+
+def test_quantisation_adds_its_own_variance() -> None:
+    expected = np.hypot(1e-3, 1e-3 / np.sqrt(12))
+    assert noise_levels(swings(noise=1e-3, quantum=1e-3)) == pytest.approx([expected], rel=0.1)
+
+
+def test_a_quantised_signal_without_noise_has_at_least_the_noise_of_rounding() -> None:
+    (found,) = noise_levels(swings(quantum=4e-3))
+    assert 4e-3 / np.sqrt(12) <= found * 1.001
+    assert found < 4e-3
+
+
+def test_exact_data_have_a_fixed_small_share_of_their_spread_as_noise() -> None:
+    data = replace(swings(noise=1e-3), exact=True)
+    spread = np.std(np.concatenate([e.qpos[:, 0] for e in data.episodes]))
+    assert noise_levels(data) == pytest.approx([EXACT * spread], rel=1e-12)
+
+
+def test_noise_without_motion_and_motion_without_noise() -> None:
+    rng = np.random.default_rng(0)
+    still = measured([clock(500)] * 4, [2e-3 * rng.standard_normal(500) for _ in range(4)])
+    assert noise_levels(still) == pytest.approx([2e-3], rel=0.1)
+    assert noise_levels(swings())[0] < 1e-5
+
+
+def test_noise_is_that_of_each_column() -> None:
+    rng = np.random.default_rng(1)
+    t = clock(2000)
+    tables = {"run": {"time": t, "qpos.a": np.sin(t) + 1e-3 * rng.standard_normal(2000), "ctrl.u": 0 * t}}
+    tables["run"]["qpos.b"] = np.cos(3 * t) + 4e-3 * rng.standard_normal(2000)
+    assert noise_levels(Measurements.from_tables(tables)) == pytest.approx([1e-3, 4e-3], rel=0.1)
+
+
+# --- smoothed state ---------------------------------------------------------------------------------------------------
+
+
+def episode(time: np.ndarray, q: np.ndarray) -> Episode:
+    empty = np.empty((len(time), 0))
+    return Episode("e", "e", time, q, np.zeros_like(q), empty, empty, empty.astype(bool))
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.8])
+@pytest.mark.parametrize("index", [0, 2, 30, 59])
+def test_smoothing_leaves_a_cubic_and_its_derivative_as_they_are(jitter: float, index: int) -> None:
+    t = clock(60, 200.0, jitter)
+    c = np.array([[0.3, -1.0], [2.0, 0.5], [-40.0, 9.0], [300.0, -70.0]])
+    powers = t[:, None] ** np.arange(4)
+    q, v, _ = smoothed_state(episode(t, powers @ c), index, np.array([1e-3, 1e-3]))
+    np.testing.assert_allclose(q, powers[index] @ c, atol=1e-11)
+    np.testing.assert_allclose(v, powers[index, :3] @ (c[1:] * np.arange(1, 4)[:, None]), atol=1e-9)
+
+
+@pytest.mark.parametrize("index", [0, 20])
+def test_spread_of_the_smoothed_state_is_that_of_repeated_noise(index: int) -> None:
+    rng, sigma = np.random.default_rng(0), np.array([1e-3, 5e-3])
+    t = clock(41, 200.0, 0.5)
+    # As many columns as draws: all are smoothed at once.
+    draws = rng.standard_normal((len(t), 2, 3000)) * sigma[:, None]
+    q, v, _ = smoothed_state(episode(t, draws.reshape(len(t), -1)), index, np.ones(6000))
+    _, _, spread = smoothed_state(episode(t, draws[:, :, 0]), index, sigma)
+    np.testing.assert_allclose(spread[0], q.reshape(2, -1).std(1), rtol=0.05)
+    np.testing.assert_allclose(spread[1], v.reshape(2, -1).std(1), rtol=0.05)
+
+
+# --- cutting ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_step_divides_the_models_and_is_at_most_a_millisecond() -> None:
+    model, data = compiled(), swings()
+    for step, expected in ((0.002, 0.001), (0.0015, 0.00075), (0.001, 0.001), (0.0005, 0.0005), (0.01, 0.001)):
+        model.opt.timestep = step
+        assert time_step(model, data) == pytest.approx(expected, rel=1e-12)
+        assert time_step(model, replace(data, exact=True)) == step
+
+
+def test_windows_lie_side_by_side_in_each_episode() -> None:
+    data = ramps([clock(300), 5 + clock(420), 9 + clock(90)])
+    windows = cut(compiled(), data, SIGMA, 0.3, 100)
+    begin, end = windows.qpos[:, 0], windows.measured[:, -1, 0]
+    np.testing.assert_allclose(end - begin, 0.3, atol=1e-9)
+    np.testing.assert_allclose(windows.qvel[:, 0], 1.0, atol=1e-8)
+    assert set(windows.episode) == {0, 1, 2}
+    for number, e in enumerate(data.episodes):
+        mine = windows.episode == number
+        np.testing.assert_allclose(begin[mine][1:], end[mine][:-1], atol=1e-9)
+        assert begin[mine][0] >= e.time[0] - 1e-9
+        assert end[mine][-1] <= e.time[-1] + 1e-9
+        assert e.time[-1] - end[mine][-1] < 0.3 + 1e-9  # nothing that would hold a window is left
+
+
+def test_no_window_spans_a_gap() -> None:
+    t = clock(400)
+    t[170:] += 2.0
+    windows = cut(compiled(), ramps([t]), SIGMA, 0.3, 100)
+    begin, end = windows.qpos[:, 0], windows.measured[:, -1, 0]
+    assert len(windows) >= 3
+    assert not np.any((begin < t[169] + 1e-6) & (end > t[170] - 1e-6))
+    assert len(np.unique(windows.episode)) == 2
+
+
+def test_no_window_begins_at_a_sample_whose_state_is_unknown_and_such_samples_do_not_count() -> None:
+    data = ramps([clock(400)])
+    usable = np.ones(400, dtype=bool)
+    usable[[8, 9, 60, 61]] = False
+    usable[120:260] = False
+    data = replace(data, episodes=[replace(data.episodes[0], usable=usable)])
+    windows = cut(compiled(), data, SIGMA, 0.2, 100)
+    begin = np.round(windows.qpos[:, 0] * 200).astype(int)
+    assert usable[begin].all()
+    count = 0
+    for b, samples, ok in zip(begin, windows.measured[:, :, 0], windows.usable):
+        rows = np.round(samples * 200).astype(int)
+        np.testing.assert_array_equal(rows, np.arange(b + 1, b + 1 + len(rows)))
+        np.testing.assert_array_equal(ok, usable[rows])
+        assert usable[b : rows[-1] + 1].mean() > 0.5
+        count += (~ok).sum()
+    assert count > 0
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.7])
+def test_commands_are_those_held_at_each_step_from_before_the_start(jitter: float) -> None:
+    t = clock(500, 200.0, jitter)
+    model, data = compiled(), ramps([t])
+    windows = cut(model, data, SIGMA, 0.3, 100)
+    h = model.opt.timestep
+    assert windows.drive.commands.shape[1] - windows.drive.before == round(0.3 / h)
+    for w in range(len(windows)):
+        t0 = t[np.argmin(np.abs(t - windows.qpos[w, 0]))]
+        grid = t0 + h * np.arange(-windows.drive.before, round(0.3 / h))
+        held = [t[t <= g + 1e-9][-1] if g >= t[0] - 1e-9 else t[0] for g in grid]
+        np.testing.assert_allclose(windows.drive.commands[w, :, 0], held, atol=1e-12)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.7])
+def test_samples_keep_their_own_times(jitter: float) -> None:
+    t = clock(500, 200.0, jitter)
+    model = compiled()
+    windows = cut(model, ramps([t]), SIGMA, 0.3, 100)
+    t0 = t[np.argmin(np.abs(t[None] - windows.qpos[:, :1]), axis=1)]
+    at = t0[:, None] + windows.at * model.opt.timestep
+    np.testing.assert_allclose(np.where(windows.usable, at - windows.measured[..., 0], 0), 0, atol=1e-6)
+    assert windows.usable.sum() > 0.9 * windows.usable.size
+    if not jitter:
+        assert not np.any(windows.at % 1)
+
+
+def test_a_window_between_samples_of_a_jittered_clock_stays_within_its_horizon() -> None:
+    windows = cut(compiled(), ramps([clock(500, 200.0, 0.7)]), SIGMA, 0.3, 100)
+    assert windows.at.max() <= windows.drive.commands.shape[1] - windows.drive.before
+
+
+def test_blocks_are_at_least_as_long_as_asked_for_and_end_with_the_episode() -> None:
+    windows = cut(compiled(), ramps([clock(900), 9 + clock(500)]), SIGMA, 0.3, 100, blocks=1.0)
+    assert windows.block[0] == 0
+    assert set(np.diff(windows.block)) <= {0, 1}
+    begin = windows.qpos[:, 0]
+    first = {b: begin[windows.block == b][0] for b in np.unique(windows.block)}
+    for b in first:
+        assert len(np.unique(windows.episode[windows.block == b])) == 1
+        if b + 1 in first and windows.episode[windows.block == b][0] == windows.episode[windows.block == b + 1][0]:
+            assert first[b + 1] - first[b] >= 1.0 - 1e-6
+    assert windows.block[-1] + 1 == 4 + 2
+
+
+def test_most_windows_are_spread_over_all_episodes() -> None:
+    data = ramps([10 * i + clock(400) for i in range(5)])
+    every, few = (cut(compiled(), data, SIGMA, 0.2, most) for most in (1000, 10))
+    assert len(every) > 30
+    assert len(few) == 10
+    assert set(few.episode) == set(range(5))
+    assert set(few.qpos[:, 0]) <= set(every.qpos[:, 0])
+
+
+def test_switched_off_actuators_are_off_step_by_step() -> None:
+    t = clock(300)
+    on = (t < 0.7) | (t > 1.0)
+    data = ramps([t], **{"enabled.motor": [on.astype(float)]})
+    model = compiled()
+    windows = cut(model, data, SIGMA, 0.3, 100)
+    assert windows.drive.enabled is not None
+    for w in range(len(windows)):
+        grid = windows.qpos[w, 0] + model.opt.timestep * np.arange(windows.drive.enabled.shape[1])
+        row = np.floor(grid * 200 + 1e-6).astype(int)
+        np.testing.assert_array_equal(windows.drive.enabled[w, :, 0], on[row])
+    assert cut(model, ramps([t]), SIGMA, 0.3, 100).drive.enabled is None
+
+
+def test_settings_of_a_run_are_those_of_its_windows() -> None:
+    data = ramps([clock(300), 9 + clock(300)], **{"param.pole.mass": [0.5, 0.7]})
+    windows = cut(compiled(), data, SIGMA, 0.3, 100)
+    (name,) = windows.drive.settings
+    assert name == "pole.mass"
+    np.testing.assert_array_equal(windows.drive.settings[name], np.where(windows.episode == 0, 0.5, 0.7))
+
+
+def test_taken_windows_are_the_same_windows() -> None:
+    data = ramps([clock(500), 9 + clock(300)], **{"param.pole.mass": [0.5, 0.7]})
+    windows = cut(compiled(), data, SIGMA, 0.3, 100)
+    index = np.array([5, 1, 5])
+    taken = windows.take(index)
+    assert len(taken) == 3
+    for name in ("qpos", "qvel", "spread", "at", "measured", "usable", "block", "episode"):
+        np.testing.assert_array_equal(getattr(taken, name), getattr(windows, name)[index])
+    np.testing.assert_array_equal(taken.drive.commands, windows.drive.commands[index])
+    np.testing.assert_array_equal(taken.drive.settings["pole.mass"], windows.drive.settings["pole.mass"][index])
+
+
+def test_a_horizon_longer_than_every_episode_is_refused_with_the_longest() -> None:
+    with pytest.raises(ValueError, match=r"window of 5 s.*longest has 1\.[45].* s.*lower horizon"):
+        cut(compiled(), ramps([clock(100), 3 + clock(300)]), SIGMA, 5.0, 10)
+
+
+def test_exact_data_start_at_the_recorded_state_with_no_spread() -> None:
+    data = recorded(noise=0.0, exact=True)
+    windows = cut(compiled(), data, SIGMA, 0.4, 100)
+    assert not windows.spread.any()
+    e = data.episodes[0]
+    np.testing.assert_array_equal(windows.qpos[0], e.qpos[0])
+    np.testing.assert_array_equal(windows.qvel[0], e.qvel[0])
+
+
+def test_columns_in_another_order_than_the_models_reach_their_places() -> None:
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
+        <body><joint name="a" axis="0 0 1"/><geom size=".1"/><body><joint name="b" axis="0 0 1"/>
+        <geom size=".1" pos="1 0 0"/></body></body></worldbody><actuator>
+        <motor name="A" joint="a"/><motor name="B" joint="b"/></actuator></mujoco>""")
+    t = clock(300)
+    columns = {"time": t, "qpos.b": t, "qpos.a": 2 * t, "ctrl.B": 0 * t + 3, "ctrl.A": 0 * t + 4}
+    windows = cut(model, Measurements.from_tables({"run": columns}), np.array([1e-3, 2e-3]), 0.3, 100)
+    np.testing.assert_allclose(windows.qvel, [[2.0, 1.0]] * len(windows), atol=1e-8)
+    np.testing.assert_array_equal(windows.columns, [1, 0])
+    np.testing.assert_array_equal(windows.sigma, [1e-3, 2e-3])
+    np.testing.assert_allclose(windows.spread[:, 0], 2 * windows.spread[:, 1])
+    b = object_id(model, "actuator", "B")
+    assert np.all(windows.drive.commands[:, :, b] == 3)
+    assert np.all(windows.drive.commands[:, :, 1 - b] == 4)
+
+
+def test_positions_that_were_not_measured_are_not_compared() -> None:
+    data = replace(recorded(noise=0.0, exact=True), unobserved=("hinge",))
+    windows = cut(mujoco.MjModel.from_xml_string(PENDULUM), data, SIGMA, 0.4, 100)
+    assert windows.measured.shape[2] == 0
+    assert len(windows.sigma) == len(windows.columns) == 0
