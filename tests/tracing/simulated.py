@@ -19,8 +19,8 @@ PENDULUM = """<mujoco><option timestep="0.001"/><worldbody><body name="pole">
 #: with a wheel beside it that nothing drives
 WITH_WHEEL = PENDULUM.replace(
     "</worldbody>",
-    """<body name="wheel" pos="3 0 0"><joint name="axle" axis="0 0 1"/><geom type="cylinder" size=".1 .1" mass="1"/></body>
-</worldbody>""",
+    """<body name="wheel" pos="3 0 0"><joint name="axle" axis="0 0 1"/><geom type="cylinder" size=".1 .1" mass="1"/>
+</body></worldbody>""",
 )
 
 
