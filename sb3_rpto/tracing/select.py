@@ -9,6 +9,7 @@ import numpy as np
 
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.screen import Screening
+from sb3_rpto.tracing.windows import Windows
 
 #: Effects must lower the typical window error by this share to stay.
 GAIN = 0.03
@@ -16,6 +17,8 @@ GAIN = 0.03
 REFIT = 5
 #: Effects whose removal raises the cost by less than this share, to second order, may go together.
 TRIFLE = 0.01
+#: Most folds of a cross-validation.
+FOLDS = 8
 #: Candidates for a substitution are the likest so many.
 SUBSTITUTES = 5
 
@@ -99,13 +102,20 @@ class Selector:
     """Fits and compares models on training and select windows.
 
     :param train: windows to fit
-    :param select: windows to judge on
+    :param select: windows to judge on; None where there are too few to set some apart: then the training windows are
+        parted into folds of blocks, each judged by a fit to the others
     :param threshold: t*, see :func:`sb3_rpto.tracing.trace.trace`
     :param say: progress
+    :param horizon: length of the windows in s, for the gap between folds
     """
 
-    def __init__(self, train: Problem, select: Problem, threshold: float, say: Say) -> None:
+    def __init__(
+        self, train: Problem, select: Problem | None, threshold: float, say: Say, horizon: float = 0.0
+    ) -> None:
         self.train, self.select, self.threshold, self.say = train, select, threshold, say
+        self.folds = [] if select else [(train.on(a), train.on(b)) for a, b in folds(train.windows, FOLDS, horizon)]
+        judged = [select] if select else [b for _, b in self.folds]
+        self.blocks = np.concatenate([p.windows.block for p in judged])
         self.simulation = train.simulation
         self._memory: dict[tuple[int, ...], Model] = {}
 
@@ -137,13 +147,21 @@ class Selector:
             if i not in key and self.simulation.effects[i].kind != "declared":
                 values[s] = self.simulation.null[s]
         fit = self.train.fit(values, self.free(key), begin.starts, iterations, tolerance=3e-3)
-        found = Model(key, fit, self.select.score(fit.values).errors)
+        found = Model(key, fit, self._errors(fit, key))
         self._memory[key] = found
         return found
 
+    def _errors(self, fit: Fit, effects: Sequence[int]) -> np.ndarray:
+        """Errors on windows that the parameters were not fitted to."""
+        if self.select:
+            return self.select.score(fit.values).errors
+        free = self.free(effects)
+        fits = [a.fit(fit.values, free, iterations=4, tolerance=3e-3) for a, _ in self.folds]
+        return np.concatenate([b.score(f.values).errors for f, (_, b) in zip(fits, self.folds)])
+
     def evidence(self, with_: Model, without: Model) -> Evidence:
         """What ``with_`` gains over ``without`` on the select windows."""
-        return compare(without.errors, with_.errors, self.select.windows.block)
+        return compare(without.errors, with_.errors, self.blocks)
 
     def eliminate(self, full: Model, base: Model) -> Selection:
         """Drop the effect whose removal costs least until all that remain are needed.
@@ -272,6 +290,24 @@ class Selector:
             g = gradient[rows] - cross.T @ gradient[known]
             gains[e] = float(g @ np.linalg.pinv(perp, rcond=1e-9) @ g)
         return gains
+
+
+def folds(windows: Windows, count: int, horizon: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Part windows into folds by whole blocks: indices to fit and to judge on, with a window's gap between them.
+
+    :param windows: which may overlap
+    :param count: most folds
+    :param horizon: length of a window in s
+    """
+    names = np.unique(windows.block)
+    turn = np.searchsorted(names, windows.block) % min(count, len(names))
+    same = windows.episode[:, None] == windows.episode
+    beside = same & (np.abs(windows.time[:, None] - windows.time) < 2 * horizon - 1e-6)
+    parts = []
+    for k in range(turn.max() + 1):
+        chosen = turn == k
+        parts.append((np.flatnonzero(~chosen & ~beside[:, chosen].any(axis=1)), np.flatnonzero(chosen)))
+    return parts
 
 
 def _ends(s: slice) -> tuple[int, int]:

@@ -21,13 +21,19 @@ from sb3_rpto.tracing.model_checks import check_against
 from sb3_rpto.tracing.report import Candidate, Report, Traced
 from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary, typical
 from sb3_rpto.tracing.screen import Screening, screen
-from sb3_rpto.tracing.select import Model, Selection, Selector
+from sb3_rpto.tracing.select import Model, Selection, Selector, folds
 from sb3_rpto.tracing.windows import Windows, cut, noise_levels, time_step
 
 #: The 95 % quantile of the largest t on complete data; see docs/tracing.md for the sets that it comes from.
 THRESHOLD = 3.5
 #: Most windows to fit, and to select on.
 TRAIN, SELECT = 48, 48
+#: Few windows overlap by this share.
+OVERLAP = 2 / 3
+#: Seconds of training data that count as short.
+SHORT = 15.0
+#: Fewer windows than this are used for both, by cross-validation.
+FEW = 40
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
 
@@ -84,12 +90,14 @@ def trace(
     if shared:
         findings.append(Finding("split", "training runs", shared))
     fitting = Problem(simulation, train_windows, scales)
-    judging = Problem(simulation, select_windows, scales)
+    judging = fitting if select_windows is None else Problem(simulation, select_windows, scales)
 
     say(0.05, "fitting the declared parameters")
-    selector = Selector(fitting, judging, THRESHOLD, lambda what: say(0.6, what))
+    apart = None if select_windows is None else judging
+    selector = Selector(fitting, apart, THRESHOLD, lambda what: say(0.6, what), horizon)
     before = fit_declared(selector, seed)
-    base = Model((), before, judging.score(before.values).errors)
+    base = selector.model((), before)
+    before = base.fit
     first = adequacy(judging, judging.score(before.values), seed)
     screening: Screening | None = None
     selection = Selection(base)
@@ -102,7 +110,8 @@ def trace(
         last = adequacy(judging, judging.score(selection.model.fit.values), seed)
 
     say(0.85, "fitting the final model")
-    final, intervals = refit(simulation, selection, train_windows, select_windows, scales, seed)
+    joined = train_windows if select_windows is None else join(train_windows, select_windows)
+    final, intervals = refit(selection, Problem(simulation, joined, scales), seed)
     verdict = judge(first, last, bool(selection.model.effects))
     say(0.9, "predicting the test runs")
     return _report(locals())
@@ -145,21 +154,12 @@ def search(selector: Selector, base: Model, screening: Screening, say: Progress)
     return selector.judge(selection)
 
 
-def refit(
-    simulation: Simulation,
-    selection: Selection,
-    train: Windows,
-    select: Windows,
-    scales: Sequence[Any],
-    seed: int,
-    resamples: int = 200,
-) -> tuple[np.ndarray, np.ndarray]:
+def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 200) -> tuple[np.ndarray, np.ndarray]:
     """Fit on train and select together; intervals by resampling blocks.
 
     :return: all parameters (p,), and their 2.5 % and 97.5 % quantiles (2, p)
     """
-    joined = join(train, select)
-    problem = Problem(simulation, joined, scales)
+    joined = problem.windows
     free = Selector(problem, problem, 0.0, lambda _: None).free(selection.model.effects)
     fit = problem.fit(selection.model.fit.values, free, iterations=10)
     intervals = np.stack([fit.values, fit.values])
@@ -181,8 +181,6 @@ def refit(
 
 def join(a: Windows, b: Windows) -> Windows:
     """All windows of both, as blocks of their own."""
-    if b is a:
-        return a
     columns = max(a.at.shape[1], b.at.shape[1])
 
     def pad(values: np.ndarray) -> np.ndarray:
@@ -213,6 +211,7 @@ def join(a: Windows, b: Windows) -> Windows:
         a.columns,
         np.concatenate([a.block, b.block + a.block.max() + 1]),
         np.concatenate([a.episode, b.episode + a.episode.max() + 1]),
+        both("time"),
     )
 
 
@@ -241,28 +240,34 @@ def _candidates(model: mujoco.MjModel, declared: list[str], kinds: Sequence[str]
 
 
 def _horizon(data: Measurements) -> float:
-    """Half a second, at least eight samples, at most a third of the longest episode."""
+    """Half a second, at least eight samples, at most a third of the longest episode.
+
+    Short data take 0.8 s: an effect shows more against the noise of so few windows.
+    """
     step = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
-    longest = max(float(e.time[-1] - e.time[0]) for e in data.episodes)
-    return min(max(0.5, 8 * step), max(longest / 3, 3 * step))
+    lengths = [float(e.time[-1] - e.time[0]) for e in data.episodes]
+    usual = 0.5 if sum(lengths) >= SHORT else 0.8
+    return min(max(usual, 8 * step), max(max(lengths) / 3, 3 * step))
 
 
 def _windows(
     model: mujoco.MjModel, train: Measurements, select: Measurements, sigma: np.ndarray, horizon: float
-) -> tuple[Windows, Windows, str]:
-    """Windows to fit and to select on; where no run is set apart, blocks of the training runs take turns."""
+) -> tuple[Windows, Windows | None, str]:
+    """Windows to fit and to select on; without runs for that, blocks of the training runs, or folds of few windows."""
     if select.episodes:
         return cut(model, train, sigma, horizon, TRAIN), cut(model, select, sigma, horizon, SELECT), ""
     every = cut(model, train, sigma, horizon, TRAIN + SELECT)
-    # Three blocks to fit, one to select on; the windows beside a select block are left out as its gap.
-    turn = every.block % 4
-    chosen = turn == 3
-    if not chosen.any() or chosen.all():
-        return every, every, "too few blocks to set some apart: effects are selected on the windows they were fitted to"
-    beside = np.roll(chosen, 1) | np.roll(chosen, -1)
-    rest = ~chosen & ~(beside & (np.diff(every.episode, append=-1) == 0))
-    message = f"selected on {int(chosen.sum())} windows of the training runs, in blocks, with a gap of one window"
-    return every.take(np.flatnonzero(rest)), every.take(np.flatnonzero(chosen)), message
+    if len(every) < FEW:
+        every = cut(model, train, sigma, horizon, 2 * FEW, overlap=OVERLAP)
+        if len(np.unique(every.block)) < 3:
+            raise ValueError(
+                f"the training runs hold {len(every)} window(s) of {horizon:g} s in fewer than three blocks of a second: "
+                "too few to select on; record longer, or lower horizon"
+            )
+        return every, None, f"selected on {len(every)} windows of the training runs by cross-validation over blocks"
+    fit, judge_ = folds(every, 4, horizon)[0]
+    message = f"selected on {len(judge_)} windows of the training runs, in blocks, with a gap of one window"
+    return every.take(fit), every.take(judge_), message
 
 
 def _report(state: dict[str, Any]) -> Report:

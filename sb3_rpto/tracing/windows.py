@@ -20,6 +20,8 @@ from sb3_rpto.tracing.measurements import Measurements
 MEMORY = 0.25
 #: Exact data (from a simulator) count as noisy by this share of a position's standard deviation.
 EXACT = 1e-4
+#: Least length of a block of windows in s; blocks count as independent.
+BLOCK = 1.0
 #: Longest integration step in s for measured data.
 FINEST = 0.001
 #: Half the time, in s, over which the state at a window's start is smoothed, and the fewest samples on each side.
@@ -41,6 +43,7 @@ class Windows:
     :param columns: addresses of the observed columns in qpos, (m,)
     :param block: number of the block of neighbouring windows, (W,); blocks are taken as independent
     :param episode: index of the episode, (W,)
+    :param time: of the start in the episode, in s, (W,)
     """
 
     qpos: np.ndarray
@@ -54,6 +57,7 @@ class Windows:
     columns: np.ndarray
     block: np.ndarray
     episode: np.ndarray
+    time: np.ndarray
 
     def __len__(self) -> int:
         return len(self.qpos)
@@ -68,6 +72,7 @@ class Windows:
             self.columns,
             self.block[index],
             self.episode[index],
+            self.time[index],
         )
 
 
@@ -134,16 +139,21 @@ def time_step(model: mujoco.MjModel, data: Measurements) -> float:
 
 
 def cut(
-    model: mujoco.MjModel, data: Measurements, sigma: np.ndarray, horizon: float, most: int, blocks: float = 1.0
+    model: mujoco.MjModel,
+    data: Measurements,
+    sigma: np.ndarray,
+    horizon: float,
+    most: int,
+    overlap: float = 0.0,
 ) -> Windows:
-    """Lay windows side by side over all episodes.
+    """Lay windows side by side over all episodes, or let them overlap.
 
     :param model: gives the time step and the order of the coordinates
     :param data: recordings
     :param sigma: noise of each position column of the data
     :param horizon: length of a window in s
     :param most: at most so many windows, evenly chosen
-    :param blocks: least length of a block of windows in s
+    :param overlap: share of a window that the next one covers too, in [0, 1)
     :raises ValueError: no episode is as long as a window
     """
     starts = []
@@ -156,7 +166,8 @@ def cut(
                 break
             if e.usable[begin] and e.usable[begin:end].mean() > 0.5:
                 starts.append((number, begin, end))
-                begin = end - 1
+                follow = e.time[begin] + (1 - overlap) * (e.time[end - 1] - e.time[begin])
+                begin = max(begin + 1, int(np.searchsorted(e.time, follow - 1e-9)))
             else:
                 begin += 1
     if not starts:
@@ -164,7 +175,7 @@ def cut(
         raise ValueError(f"no episode holds a window of {horizon:g} s (the longest has {longest:.3g} s); lower horizon")
     if len(starts) > most:
         starts = [starts[i] for i in np.linspace(0, len(starts) - 1, most).round().astype(int)]
-    return _build(model, data, sigma, horizon, starts, blocks)
+    return _build(model, data, sigma, horizon, starts)
 
 
 def _build(
@@ -173,7 +184,6 @@ def _build(
     sigma: np.ndarray,
     horizon: float,
     starts: Sequence[tuple[int, int, int]],
-    blocks: float,
 ) -> Windows:
     h = float(model.opt.timestep)
     steps, before = math.ceil(horizon / h - 1e-6), math.ceil(MEMORY / h)
@@ -204,7 +214,7 @@ def _build(
         at[w] = np.where(np.abs(at[w] - whole) < 1e-3, whole, at[w])
         measured[w, :n] = e.qpos[begin + 1 : end][:, observed]
         usable[w, :n] = e.usable[begin + 1 : end]
-        if number != last[0] or t0 - last[1] >= blocks - 1e-9:
+        if number != last[0] or t0 - last[1] >= BLOCK - 1e-9:
             last = (number, t0)
             block[w] = block[w - 1] + 1 if w else 0
         else:
@@ -223,6 +233,7 @@ def _build(
         addresses[observed],
         block,
         np.array([number for number, _, _ in starts]),
+        np.array([data.episodes[number].time[begin] for number, begin, _ in starts]),
     )
 
 

@@ -208,7 +208,7 @@ def test_a_window_between_samples_of_a_jittered_clock_stays_within_its_horizon()
 
 
 def test_blocks_are_at_least_as_long_as_asked_for_and_end_with_the_episode() -> None:
-    windows = cut(compiled(), ramps([clock(900), 9 + clock(500)]), SIGMA, 0.3, 100, blocks=1.0)
+    windows = cut(compiled(), ramps([clock(900), 9 + clock(500)]), SIGMA, 0.3, 100)
     assert windows.block[0] == 0
     assert set(np.diff(windows.block)) <= {0, 1}
     begin = windows.qpos[:, 0]

@@ -1,0 +1,203 @@
+"""Selection: evidence against numbers worked out by hand, and eliminations on small problems."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from simulated import problem, recorded
+
+from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.forces import TorqueOffset
+from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, ViscousFriction
+from sb3_rpto.tracing.screen import screen
+from sb3_rpto.tracing.select import GAIN, Evidence, Selection, Selector, compare
+
+THRESHOLD = 3.5
+COULOMB, OFFSET, DRAG = 0, 1, 2
+
+
+def selector(planted: list[Effect], effects: list[Effect] | None = None, seed: int = 0) -> Selector:
+    effects = effects or [CoulombFriction("hinge"), TorqueOffset("hinge"), QuadraticDrag("hinge")]
+    train = problem(effects, recorded(planted, seed=seed, episodes=5))
+    select = problem(effects, recorded(planted, seed=seed + 100, episodes=5))
+    return Selector(train, select, THRESHOLD, lambda what: None)
+
+
+def eliminated(s: Selector) -> Selection:
+    count = range(len(s.simulation.effects))
+    base = s.model((), s.train.score(s.train.null))
+    full = s.together(list(count), base.fit)
+    return s.eliminate(full, base)
+
+
+@cache
+def with_friction() -> tuple[Selector, Selection]:
+    s = selector([CoulombFriction("hinge", level=0.08)])
+    return s, eliminated(s)
+
+
+# --- evidence ---------------------------------------------------------------------------------------------------------
+
+
+def test_gain_and_t_are_those_of_the_mean_log_ratio_of_blocks() -> None:
+    without = np.exp(np.array([0.5, 0.3, 0.2, 0.0, 0.6]))
+    evidence = compare(without, np.ones(5), np.array([0, 0, 1, 1, 4]))
+    np.testing.assert_allclose(evidence.blocks, [0.4, 0.1, 0.6])
+    mean = 1.1 / 3
+    error = np.std([0.4, 0.1, 0.6], ddof=1) / np.sqrt(3)
+    assert evidence.gain == pytest.approx(1 - np.exp(-mean))
+    assert evidence.t == pytest.approx(mean / error)
+
+
+def test_evidence_changes_its_sign_with_the_models() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(1, 2, (2, 12))
+    blocks = np.arange(12) // 3
+    assert compare(a, b, blocks).t == pytest.approx(-compare(b, a, blocks).t)
+    assert compare(a, a, blocks).gain == 0
+    assert compare(a, a, blocks).t == 0
+
+
+def test_blocks_that_agree_by_chance_have_a_finite_t() -> None:
+    evidence = compare(np.full(4, 1.05), np.ones(4), np.arange(4))
+    assert evidence.t == pytest.approx(np.log(1.05) / (0.01 / 2))
+
+
+def test_one_block_is_no_evidence() -> None:
+    evidence = compare(np.full(4, 2.0), np.ones(4), np.zeros(4, dtype=int))
+    assert evidence.gain == pytest.approx(0.5)
+    assert evidence.t == 0
+    assert not evidence.clear(0.1)
+
+
+def test_clear_takes_more_than_chance_and_more_than_a_trifle() -> None:
+    blocks = np.zeros(3)
+    assert Evidence(GAIN + 0.01, 4.0, blocks).clear(3.5)
+    assert not Evidence(GAIN + 0.01, 3.4, blocks).clear(3.5)
+    assert not Evidence(GAIN - 0.01, 40.0, blocks).clear(3.5)
+    assert not Evidence(-0.5, -9.0, blocks).clear(3.5)
+
+
+def test_errors_of_zero_are_compared_without_infinities() -> None:
+    evidence = compare(np.zeros(4), np.zeros(4), np.arange(4))
+    assert evidence.gain == 0
+    assert np.isfinite(compare(np.ones(4), np.zeros(4), np.arange(4)).t)
+
+
+def test_frequency_is_the_share_of_resamples_that_are_clear() -> None:
+    sure, never = np.full(20, 0.5), np.full(20, -0.1)
+    assert compare(np.exp(sure), np.ones(20), np.arange(20)).frequency(3.5, np.random.default_rng(0)) == 1
+    assert compare(np.exp(never), np.ones(20), np.arange(20)).frequency(3.5, np.random.default_rng(0)) == 0
+    rng = np.random.default_rng(1)
+    noisy = rng.normal(0.35, 0.45, 20)
+    evidence = compare(np.exp(noisy), np.ones(20), np.arange(20))
+    draws = noisy[np.random.default_rng(2).integers(20, size=(20000, 20))]
+    t = draws.mean(1) / (draws.std(1, ddof=1) / np.sqrt(20))
+    expected = np.mean((t > 3.5) & (1 - np.exp(-draws.mean(1)) > GAIN))
+    assert 0.1 < expected < 0.9
+    found = evidence.frequency(3.5, np.random.default_rng(3), resamples=2000)
+    assert found == pytest.approx(expected, abs=0.05)
+
+
+# --- fits and elimination ---------------------------------------------------------------------------------------------
+
+
+def test_elimination_keeps_the_planted_effect_and_drops_the_others() -> None:
+    s, selection = with_friction()
+    assert selection.model.effects == (COULOMB,)
+    assert selection.model.fit.values[0] == pytest.approx(0.08, rel=0.05)
+    np.testing.assert_array_equal(selection.model.fit.values[1:], 0)
+    assert set(selection.dropped) == {OFFSET, DRAG}
+    assert all(step >= 1 for step, _ in selection.dropped.values())
+
+
+def test_two_planted_effects_are_kept_together() -> None:
+    s = selector([TorqueOffset("hinge", offset=0.06), QuadraticDrag("hinge", coefficient=0.01)], seed=3)
+    selection = s.judge(eliminated(s))
+    assert selection.model.effects == (OFFSET, DRAG)
+    assert all(e.clear(THRESHOLD) for e in selection.evidence.values())
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_nothing_is_kept_on_complete_data(seed: int) -> None:
+    s = selector([], seed=seed)
+    selection = s.judge(eliminated(s))
+    assert selection.model.effects == ()
+    assert selection.evidence == {}
+    np.testing.assert_array_equal(selection.model.fit.values, s.train.null)
+
+
+def test_judging_drops_what_does_not_help() -> None:
+    s, kept = with_friction()
+    both = s.model([COULOMB, DRAG], kept.model.fit)
+    selection = s.judge(Selection(both))
+    assert selection.model.effects == (COULOMB,)
+    assert set(selection.evidence) == {COULOMB}
+    assert selection.evidence[COULOMB].gain > 0.3
+    step, evidence = selection.dropped[DRAG]
+    assert step == 0
+    assert not evidence.clear(THRESHOLD)
+
+
+def test_looking_forward_brings_a_wrongly_dropped_effect_back() -> None:
+    s, _ = with_friction()
+    nothing = Selection(s.model((), s.train.score(s.train.null)))
+    nothing.dropped[COULOMB] = (1, None)
+    found = s.add_back(nothing, [COULOMB, OFFSET, DRAG])
+    assert found.model.effects == (COULOMB,)
+    assert COULOMB not in found.dropped
+
+
+def test_a_larger_model_begins_at_the_smaller_ones_optimum_and_is_never_worse() -> None:
+    s = selector([CoulombFriction("hinge", level=0.04), TorqueOffset("hinge", offset=0.02)], seed=5)
+    small = s.model((), s.train.score(s.train.null))
+    for grown in ([COULOMB], [COULOMB, OFFSET], [COULOMB, OFFSET, DRAG]):
+        large = s.model(grown, small.fit)
+        assert large.fit.cost <= small.fit.cost * (1 + 1e-9)
+        small = large
+    # With no iteration to spend on it, it is the smaller one.
+    fresh = Selector(s.train, s.select, THRESHOLD, s.say)
+    begin = small.fit
+    assert fresh.model([COULOMB, OFFSET, DRAG], begin, iterations=1).fit.cost <= begin.cost * (1 + 1e-9)
+
+
+def test_effects_that_are_not_in_a_model_are_at_their_null_in_it() -> None:
+    s, selection = with_friction()
+    full = s.model([COULOMB, OFFSET, DRAG], selection.model.fit)
+    less = s.model([OFFSET], full.fit)
+    np.testing.assert_array_equal(less.fit.values[[COULOMB, DRAG]], 0)
+    assert less.effects == (OFFSET,)
+
+
+def test_the_planted_effects_removal_costs_most() -> None:
+    s, selection = with_friction()
+    full = s.model([COULOMB, OFFSET, DRAG], selection.model.fit)
+    order, costs = s.removal_costs(full)
+    assert order[-1] == COULOMB
+    assert order == sorted(costs, key=costs.get)
+    assert costs[COULOMB] > 20 * max(costs[OFFSET], costs[DRAG])
+
+
+def test_the_cost_of_a_removal_is_that_of_the_fit_without_it_where_the_effect_is_small() -> None:
+    s = selector([TorqueOffset("hinge", offset=0.004)], [TorqueOffset("hinge")], seed=7)
+    full = s.model([0], s.train.score(s.train.null), iterations=20)
+    _, costs = s.removal_costs(full)
+    less = s.train.fit(s.train.null, np.empty(0, dtype=int), full.fit.starts, iterations=20, tolerance=1e-6)
+    assert costs[0] == pytest.approx(less.cost - full.fit.cost, rel=0.1)
+
+
+def test_substitution_replaces_a_wrong_effect_by_the_right_one() -> None:
+    effects: list[Effect] = [CoulombFriction("hinge"), ViscousFriction("hinge")]
+    s = selector([CoulombFriction("hinge", level=0.08)], effects, seed=2)
+    wrong = s.model([1], s.train.score(s.train.null), 12)
+    found = s.substitute(Selection(wrong), screen(s.train, s.train.score(s.train.null)))
+    assert found.model.effects == (0,)
+
+
+def test_evidence_is_judged_on_the_select_windows_alone() -> None:
+    s, selection = with_friction()
+    base = s.model((), s.train.score(s.train.null))
+    other = Selector(s.train, s.select, THRESHOLD, s.say)
+    worse = replace(selection.model, errors=2 * base.errors)
+    assert other.evidence(worse, base).gain == pytest.approx(1 - 2)
