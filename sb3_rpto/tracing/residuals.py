@@ -1,4 +1,4 @@
-"""The generalised force that a model lacks, by inverse dynamics: for plots, scales and screening, never for decisions."""
+"""The generalised force that a model lacks, by inverse dynamics: for plots, scales, screening; never for decisions."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from sb3_rpto.tracing.windows import command_order, scalar_joints
 
 #: Cut-off of the zero-phase low pass in Hz; lower where the sampling asks for it.
 CUTOFF = 15.0
+#: Ends are left out over so many periods of the cut-off: filters and differences bend them by more than any effect.
+EDGE = 1.5
 #: Speeds below this share of the typical one count as rest, where dry friction has no known sign.
 REST = 0.05
 
@@ -27,7 +29,7 @@ class ForceResidual:
     """What inverse dynamics lacks in one episode, all filtered in the same way.
 
     :param episode: its name
-    :param time: uniform times in s, (T,)
+    :param time: uniform times in s, (T,); the ends of the episode, where filters err, are left out
     :param qpos: rad or m, (T, nv), of scalar joints (others are zero)
     :param qvel: rad/s or m/s, (T, nv)
     :param load: generalised force of the actuators as the model has it, N·m or N, (T, nv)
@@ -81,6 +83,8 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
         if effect.kind == "declared" or np.any((values[s] != simulation.null[s])[simulation.strength[s]])
     ]
     commands = filter_commands(active, commands, h)[0]
+    # The motion at a sample answers to the commands held before and after it alike.
+    around = 0.5 * (commands + np.concatenate([commands[:1], commands[:-1]]))
     world = BatchWorld(nominal, 1, 1)
     for name, value in e.params.items():
         simulation._setting(name).write(world, np.array([[value]]))
@@ -95,7 +99,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     extra = np.zeros_like(qvel)
     acting = [(effect, x) for effect, x in active if effect.overrides("act")]
     for t in range(len(time)):
-        mj.qpos[:], mj.qvel[:], mj.ctrl[:] = qpos[t], qvel[t], commands[t]
+        mj.qpos[:], mj.qvel[:], mj.ctrl[:] = qpos[t], qvel[t], around[t]
         mujoco.mj_forward(model, mj)
         load[t] = mj.qfrc_actuator
         mj.qacc[:] = qacc[t]
@@ -104,7 +108,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
         level = friction.copy()
         if acting:
             world.qpos[:], world.qvel[:] = qpos[t], qvel[t]
-            world.ctrl[:] = commands[t]
+            world.ctrl[:] = around[t]
             world.batch.forward()
             world.force[:] = 0
             world.friction[:] = 0
@@ -115,12 +119,18 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
         extra[t] -= level * np.sign(qvel[t])
     load = np.stack([low(column) for column in load.T], axis=1)
     extra = np.stack([low(column) for column in extra.T], axis=1)
-    return ForceResidual(e.name, time - time[0], shown, qvel, load, commands, needed - load - extra)
+    force = needed - load - extra
+    edge = min(round(EDGE / (_cutoff(h) * h)), len(time) // 4)
+    arrays = (a[edge : len(time) - edge] for a in (time - time[0], shown, qvel, load, commands, force))
+    return ForceResidual(e.name, *arrays)
+
+
+def _cutoff(h: float) -> float:
+    return min(CUTOFF, 0.2 / h)
 
 
 def _low_pass(h: float, length: int):  # type: ignore[no-untyped-def]
-    cutoff = min(CUTOFF, 0.2 / h)
-    b, a = butter(2, 2 * cutoff * h)
+    b, a = butter(2, 2 * _cutoff(h) * h)
     pad = min(length - 1, 60)
     return lambda signal: filtfilt(b, a, signal, padlen=pad)
 
@@ -188,4 +198,4 @@ def learnable_share(residuals: list[ForceResidual], seed: int, features: int = 2
         left[b] = y[b] - y[a].mean(0) - design[b] @ weights
     total = np.sum((y - y.mean(0)) ** 2, axis=0)
     share = 1 - np.sum(left**2, axis=0) / np.maximum(total, 1e-12)
-    return np.clip(share, 0.0, 1.0)
+    return np.where(total > 1e-12, np.clip(share, 0.0, 1.0), 0.0)

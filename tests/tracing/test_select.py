@@ -179,11 +179,11 @@ def test_the_planted_effects_removal_costs_most() -> None:
 
 
 def test_the_cost_of_a_removal_is_that_of_the_fit_without_it_where_the_effect_is_small() -> None:
-    s = selector([TorqueOffset("hinge", offset=0.004)], [TorqueOffset("hinge")], seed=7)
+    s = selector([TorqueOffset("hinge", offset=0.001)], [TorqueOffset("hinge")], seed=7)
     full = s.model([0], s.train.score(s.train.null), iterations=20)
     _, costs = s.removal_costs(full)
     less = s.train.fit(s.train.null, np.empty(0, dtype=int), full.fit.starts, iterations=20, tolerance=1e-6)
-    assert costs[0] == pytest.approx(less.cost - full.fit.cost, rel=0.1)
+    assert costs[0] == pytest.approx(less.cost - full.fit.cost, rel=0.15)
 
 
 def test_substitution_replaces_a_wrong_effect_by_the_right_one() -> None:
