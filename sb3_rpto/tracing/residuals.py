@@ -11,10 +11,11 @@ from scipy.signal import butter, filtfilt
 from sb3_rpto.effects import Simulation
 from sb3_rpto.effects.simulation import filter_commands, names_of, prepare
 from sb3_rpto.effects.world import BatchWorld
+from sb3_rpto.tracing.checks import MIN_ROWS
 from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.identify import Typical
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.windows import command_order, scalar_joints
+from sb3_rpto.tracing.windows import command_order, scalar_joints, velocity_addresses
 
 #: Cut-off of the zero-phase low pass in Hz; lower where the sampling asks for it.
 CUTOFF = 15.0
@@ -49,11 +50,13 @@ class ForceResidual:
 def force_residuals(simulation: Simulation, values: np.ndarray, data: Measurements) -> list[ForceResidual]:
     """Inverse dynamics of every episode: the force that the motion needed and the model does not know.
 
+    Exact data are not filtered, and their velocities are taken as they are.
+
     :param simulation: the model with its effects
     :param values: their parameters, (p,)
     :param data: recordings
     """
-    return [_residual(simulation, values, data, e) for e in data.episodes if len(e) > 30]
+    return [_residual(simulation, values, data, e) for e in data.episodes if len(e) >= MIN_ROWS]
 
 
 def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e: Episode) -> ForceResidual:
@@ -63,9 +66,9 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     addresses = names_of(nominal, data.columns.qpos)
     scalar = {int(nominal.jnt_qposadr[j]): int(nominal.jnt_dofadr[j]) for j in scalar_joints(nominal)}
     qpos = np.tile(nominal.qpos0, (len(time), 1))
-    qvel, qacc = np.zeros((len(time), nominal.nv)), np.zeros((len(time), nominal.nv))
+    qvel = np.zeros((len(time), nominal.nv))
     shown = np.zeros((len(time), nominal.nv))
-    low = _low_pass(h, len(time))
+    low = (lambda signal: signal) if data.exact else _low_pass(h, len(time))
     for column, address in enumerate(addresses):
         path = low(np.interp(time, e.time, e.qpos[:, column]))
         qpos[:, address] = path
@@ -73,7 +76,10 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
             dof = scalar[int(address)]
             shown[:, dof] = path
             qvel[:, dof] = np.gradient(path, h)
-            qacc[:, dof] = np.gradient(qvel[:, dof], h)
+    if data.exact:
+        for column, dof in enumerate(velocity_addresses(nominal, data)):
+            qvel[:, dof] = np.interp(time, e.time, e.qvel[:, column])
+    qacc = np.gradient(qvel, h, axis=0)
     row = np.clip(np.searchsorted(e.time, time + 1e-9, side="right") - 1, 0, len(e) - 1)
     commands = np.zeros((1, len(time), nominal.nu))
     commands[0][:, command_order(nominal, data)] = e.ctrl[row] * e.enabled[row]
@@ -120,7 +126,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     load = np.stack([low(column) for column in load.T], axis=1)
     extra = np.stack([low(column) for column in extra.T], axis=1)
     force = needed - load - extra
-    edge = min(round(EDGE / (_cutoff(h) * h)), len(time) // 4)
+    edge = 1 if data.exact else min(round(EDGE / (_cutoff(h) * h)), len(time) // 4)
     arrays = (a[edge : len(time) - edge] for a in (time - time[0], shown, qvel, load, commands, force))
     return ForceResidual(e.name, *arrays)
 
@@ -136,7 +142,12 @@ def _low_pass(h: float, length: int):  # type: ignore[no-untyped-def]
 
 
 def typical(simulation: Simulation, residuals: list[ForceResidual]) -> Typical:
-    """Typical magnitudes, from the residuals of the nominal model (its own load and what it lacks)."""
+    """Typical magnitudes, from the residuals of the nominal model (its own load and what it lacks).
+
+    :raises ValueError: there are none
+    """
+    if not residuals:
+        raise ValueError(f"no episode has {MIN_ROWS} samples to find forces from; record longer ones")
     model = simulation.model
     mj = mujoco.MjData(model)
     mujoco.mj_forward(model, mj)
