@@ -1,0 +1,57 @@
+"""How often the tracer is right, on generated sets whose truth is known: ``sb3-rpto benchmark tracing``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+from sb3_rpto.experiments.tracing_benchmark.design import SCALES, Case, design
+from sb3_rpto.experiments.tracing_benchmark.run import run, selected
+from sb3_rpto.experiments.tracing_benchmark.score import score
+from sb3_rpto.experiments.tracing_benchmark.table import table, write
+
+__all__ = ["Case", "add_arguments", "design", "main", "run", "run_benchmark", "score", "table"]
+
+NAME = "sb3-rpto benchmark tracing"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of :func:`run_benchmark`."""
+    parser.add_argument("--out", metavar="DIR", required=True, help="folder for the table; results go to DIR/cases")
+    parser.add_argument("--scale", choices=SCALES, default="quick", help="20 or 200 sets (default: quick)")
+    parser.add_argument("--workers", metavar="N", type=int, help="processes, of one thread each (default: one a core)")
+    parser.add_argument("--only", metavar="REGEX", help="only sets whose id matches somewhere, e.g. '^single-.*1mrad'")
+    parser.add_argument("--fresh", action="store_true", help="trace again what has a result already")
+    parser.add_argument("--list", action="store_true", help="print the ids and stop")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    :param arguments: without the program's name; default: those of the process
+    :return: exit code
+    """
+    parser = argparse.ArgumentParser(prog=NAME, description=__doc__)
+    add_arguments(parser)
+    parsed = parser.parse_args(arguments)
+    if parsed.list:
+        print("\n".join(case.id for case in selected(parsed.scale, parsed.only)))
+        return 0
+    return run_benchmark(parsed.out, parsed.scale, parsed.workers, not parsed.fresh, parsed.only)
+
+
+def run_benchmark(out: str, scale: str, workers: int | None, resume: bool, only: str | None = None) -> int:
+    """Trace what has no result yet, then write and print the table of all that has one.
+
+    :param out: folder for ``table.md``, ``summary.csv``, ``cases.csv``, ``manifest.json`` and ``cases/``
+    :param scale: ``"quick"`` or ``"full"``
+    :param workers: processes; None: one a core
+    :param resume: False: trace again what has a result already
+    :param only: regular expression that a case's id must match somewhere
+    :return: exit code, 0: a table that shows failures is a result
+    :raises ValueError: nothing matches, or a setting out of range
+    """
+    results = run(out, scale, workers, only, resume)
+    command = f"{NAME} --scale {scale}" + (f" --only '{only}'" if only else "")
+    print(write(out, results, selected(scale, only), command))
+    return 0
