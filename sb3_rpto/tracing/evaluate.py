@@ -15,6 +15,8 @@ from sb3_rpto.tracing.windows import Windows, cut
 HORIZONS = (0.1, 0.5, 1.0)
 MOST = 200
 RESAMPLES = 400
+#: Draws of the noise for each window of the floor: few windows of a long horizon say little by one draw each.
+DRAWS = 8
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ def noise_floor(
 ) -> list[HorizonError]:
     """The errors that a true model would have: those of the measured positions and of the smoothed starts.
 
-    Each window is predicted twice, from its start and from one that errs as smoothing noise lets it err.
+    Each window is predicted from its start and from several that err as smoothing noise lets them err.
 
     :return: as :func:`horizon_errors`, whole runs left out; empty for exact data
     """
@@ -148,13 +150,14 @@ def noise_floor(
         except ValueError:
             continue
         problem = Problem(simulation, windows, [Scales()] * len(simulation.effects))
-        count, all_values = len(windows), np.tile(values, (len(windows), 1))
-        draws = rng.standard_normal(windows.spread.shape) / TRUST
-        true = problem.predict(all_values, np.zeros_like(draws), np.arange(count))
-        off = problem.predict(all_values, draws, np.arange(count))
+        count, index = len(windows), np.tile(np.arange(len(windows)), DRAWS)
+        starts = rng.standard_normal((len(index), windows.spread.shape[1])) / TRUST
+        true = problem.predict(np.tile(values, (count, 1)), np.zeros_like(starts[:count]), np.arange(count))[index]
+        off = problem.predict(np.tile(values, (len(index), 1)), starts, index)
         noise = rng.standard_normal(true.shape) * windows.sigma
-        usable = windows.usable & np.isfinite(true).all(-1) & np.isfinite(off).all(-1)
-        found.append(_pool(off - true + noise, usable, windows, _observed(data), horizon, seed))
+        usable = windows.usable[index] & np.isfinite(true).all(-1) & np.isfinite(off).all(-1)
+        pooled = _pool(off - true + noise, usable, windows.take(index), _observed(data), horizon, seed)
+        found.append(replace(pooled, windows=count))
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -135,7 +136,7 @@ def _cutoff(h: float) -> float:
     return min(CUTOFF, 0.2 / h)
 
 
-def _low_pass(h: float, length: int):  # type: ignore[no-untyped-def]
+def _low_pass(h: float, length: int) -> Callable[[np.ndarray], np.ndarray]:
     b, a = butter(2, 2 * _cutoff(h) * h)
     pad = min(length - 1, 60)
     return lambda signal: filtfilt(b, a, signal, padlen=pad)

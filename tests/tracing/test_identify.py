@@ -15,7 +15,7 @@ from sb3_rpto.effects.effect import Effect, Parameter
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.effects.sensors import SensorBias
-from sb3_rpto.tracing.identify import RIDGE, TRUST, UNSTABLE, Problem, bounded_step, hold, interpolate, robust_scale
+from sb3_rpto.tracing.identify import RIDGE, TRUST, UNSTABLE, Loss, Problem, bounded_step, interpolate
 
 DECLARED = ["hinge.damping", "pole.mass"]
 TRUE = np.array([0.08, 0.62])
@@ -171,15 +171,15 @@ def test_the_derivative_at_a_bound_points_inside() -> None:
 
 def test_starts_are_eliminated_as_in_the_full_normal_equations() -> None:
     p = declared_problem()
-    count, clip = len(p.windows), 3.0
+    count, loss = len(p.windows), Loss(3.0)
     starts = 0.2 * np.random.default_rng(1).standard_normal((count, 2))
     r, jt, jx = p.linearise(np.array([0.06, 0.55]), starts, np.array([0, 1]))
-    reduced = p.reduce(r, jt, jx, starts, clip)
+    reduced = p.reduce(r, jt, jx, starts, loss)
     for w in (0, count - 1):
-        weight = 1 / np.sqrt(1 + (r[w] / clip) ** 2)
+        weight = 1 / np.sqrt(1 + (r[w] / loss.clip) ** 2)
         j = np.concatenate([jt[w], jx[w]], axis=1)
-        full = (j * weight[:, None]).T @ j + np.diag([0, 0, hold(clip), hold(clip)])
-        gradient = (j * weight[:, None]).T @ r[w] + np.concatenate([[0, 0], hold(clip) * starts[w]])
+        full = (j * weight[:, None]).T @ j + np.diag([0, 0, loss.hold, loss.hold])
+        gradient = (j * weight[:, None]).T @ r[w] + np.concatenate([[0, 0], loss.hold * starts[w]])
         inner = np.linalg.inv(full[2:, 2:])
         np.testing.assert_allclose(reduced.normal[w], full[:2, :2] - full[:2, 2:] @ inner @ full[2:, :2], rtol=1e-7)
         np.testing.assert_allclose(
@@ -205,13 +205,13 @@ def test_a_fit_of_noisy_data_is_scipys_on_the_same_cost(seed: int) -> None:
     count = len(p.windows)
     fit = p.fit(p.null, np.arange(2), iterations=30, tolerance=1e-7)
     np.testing.assert_allclose(fit.values, TRUE, rtol=0.1)
-    clip = robust_scale(p.residuals(np.tile(fit.values, (count, 1)), fit.starts, np.arange(count)))
+    loss = Loss.of(p.residuals(np.tile(fit.values, (count, 1)), fit.starts, np.arange(count)))
 
     def parts(x: np.ndarray) -> np.ndarray:
         values, starts = x[:2] * p.size, x[2:].reshape(count, 2)
         r = p.residuals(np.tile(values, (count, 1)), starts, np.arange(count))
-        soft = np.sign(r) * clip * np.sqrt(2 * (np.sqrt(1 + (r / clip) ** 2) - 1))
-        return np.concatenate([soft.ravel(), np.sqrt(hold(clip)) * starts.ravel()])
+        soft = np.sign(r) * loss.clip * np.sqrt(2 * (np.sqrt(1 + (r / loss.clip) ** 2) - 1))
+        return np.concatenate([soft.ravel(), np.sqrt(loss.hold) * starts.ravel()])
 
     begin = np.concatenate([fit.values / p.size, fit.starts.ravel()])
     found = least_squares(parts, begin, diff_step=1e-4, max_nfev=8)
@@ -238,7 +238,7 @@ def test_a_fit_is_never_worse_than_where_it_began(damping: float, mass: float, s
     count = len(p.windows)
     values, starts = np.array([damping, mass]), np.random.default_rng(seed).standard_normal((count, 2))
     r = p.residuals(np.tile(values, (count, 1)), starts, np.arange(count))
-    began = float(p.cost(r, starts, values, robust_scale(r)))
+    began = float(p.cost(r, starts, values, Loss.of(r)))
     fit = p.fit(values, np.arange(2), starts, iterations=2)
     assert fit.cost <= began * (1 + 1e-9)
     assert np.all((fit.values >= p.lower) & (fit.values <= p.upper))
@@ -333,9 +333,9 @@ def test_the_pull_towards_the_null_is_on_effects_alone() -> None:
     count = len(p.windows)
     r, starts = np.zeros((count, 5)), np.zeros((count, 2))
     away = p.null + np.array([3, -2, 0]) * p.size
-    assert p.cost(r, starts, away, 3.0) == 0
+    assert p.cost(r, starts, away, Loss(3.0)) == 0
     away[2] = 2 * p.size[2]
-    assert p.cost(r, starts, away, 3.0) == pytest.approx((2 / RIDGE) ** 2)
+    assert p.cost(r, starts, away, Loss(3.0)) == pytest.approx((2 / RIDGE) ** 2)
 
 
 # --- noise ------------------------------------------------------------------------------------------------------------

@@ -116,7 +116,9 @@ def test_a_declared_parameter_without_influence_hides_nothing() -> None:
     assert found[0, 0] == pytest.approx(rest @ rest)
 
 
-@pytest.mark.xfail(raises=np.linalg.LinAlgError, reason="the ridge is zero when no declared parameter has influence")
+@pytest.mark.xfail(
+    strict=True, raises=np.linalg.LinAlgError, reason="the ridge is zero when no declared parameter has influence"
+)
 def test_declared_parameters_of_which_none_has_influence_hide_nothing() -> None:
     j = np.random.default_rng(0).standard_normal((40, 2))
     j[:, 0] = 0

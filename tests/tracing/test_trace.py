@@ -1,0 +1,276 @@
+"""Tracing as a whole, through the public API."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from simulated import WITH_WHEEL, compiled, recorded
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from sb3_rpto.experiments.planting import Planted, generate
+from sb3_rpto.tracing import Measurements, Report, trace
+
+KINDS = ["coulomb_friction", "torque_offset"]
+#: what may change when only the test runs do
+TESTED = {"before", "after", "floor", "force_before", "force_after", "learnable"}
+
+
+@cache
+def planted(*effects: tuple[str, str], seed: int = 1, episodes: int = 6) -> Planted:
+    return generate("pendulum", list(effects), seed=seed, episodes=episodes, duration=2.5)
+
+
+def traced(p: Planted, data: Measurements | None = None, kinds: Sequence[str] = KINDS, seed: int = 0) -> Report:
+    return trace(p.xml, data or p.measurements, p.declared, seed=seed, candidates=kinds, threads=1)
+
+
+@cache
+def complete(seed: int) -> Report:
+    return traced(planted(seed=seed))
+
+
+@cache
+def with_friction() -> Report:
+    return traced(planted(("coulomb_friction", "large")))
+
+
+def parted(data: Measurements, parts: Sequence[str]) -> Measurements:
+    return replace(data, episodes=[replace(e, part=p) for e, p in zip(data.episodes, parts, strict=True)])
+
+
+# --- verdicts ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_complete_model_is_complete_and_nothing_is_named(seed: int) -> None:
+    p, report = planted(seed=seed), complete(seed)
+    assert report.verdict == "complete"
+    assert report.effects == []
+    assert {c.status for c in report.candidates} == {"not needed"}
+    for t in report.declared:
+        truth = p.truth.declared[t.label]
+        low, high = t.interval[:, 0]
+        assert low <= t.effect.values[0] <= high
+        assert t.effect.values[0] == pytest.approx(truth, rel=0.05 if t.label == "pole.mass" else 0.25)
+    # A second and whole runs are but a few predictions.
+    for before, floor in zip(report.before[:2], report.floor[:2], strict=True):
+        assert before.horizon == floor.horizon
+        assert 0.5 < before.rmse[0] / floor.rmse[0] < 1.6
+
+
+def test_dry_friction_is_explained_with_its_level() -> None:
+    report, p = with_friction(), planted(("coulomb_friction", "large"))
+    assert report.verdict == "explained"
+    (found,) = report.effects
+    assert found.label == "coulomb_friction(hinge)"
+    assert found.effect.values[0] == pytest.approx(p.truth.effects["coulomb_friction"]["torque"], rel=0.05)
+    low, high = found.interval[:, 0]
+    assert low < found.effect.values[0] < high
+    assert found.t > report.threshold
+    assert found.frequency > 0.8
+    assert not report.adequacy_before.adequate
+    assert report.adequacy_after.adequate
+    assert report.adequacy_after.ratio < 0.5 * report.adequacy_before.ratio
+    for before, after in zip(report.before, report.after, strict=True):
+        assert after.rmse[0] < before.rmse[0]
+    assert report.force_after[0] < report.force_before[0]
+    assert {c.label: c.status for c in report.candidates}["coulomb_friction(hinge)"] == "kept"
+
+
+def test_what_lies_outside_the_library_is_not_explained() -> None:
+    report = traced(planted(("wind_gusts", "large")))
+    assert report.verdict in ("unexplained", "partly explained")
+    assert not report.adequacy_before.adequate
+
+
+def test_an_effect_that_is_not_among_the_candidates_is_not_explained() -> None:
+    report = traced(planted(("coulomb_friction", "large")), kinds=["torque_offset"])
+    assert report.verdict == "unexplained"
+    assert [c.label for c in report.candidates] == ["torque_offset(hinge)"]
+
+
+# --- what a report depends on -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_report_to_the_last_bit() -> None:
+    again = traced(planted(("coulomb_friction", "large")))
+    assert json.dumps(again.to_json()) == json.dumps(with_friction().to_json())
+
+
+def test_nothing_but_the_errors_depends_on_the_numbers_of_the_test_runs() -> None:
+    report, data = with_friction(), planted(("coulomb_friction", "large")).measurements
+    rng = np.random.default_rng(0)
+    changed = []
+    for e in data.episodes:
+        if e.run in report.runs["test"]:
+            # Another amplitude, and ten times the noise.
+            q = 0.7 * e.qpos + 0.01 * rng.standard_normal(e.qpos.shape)
+            e = replace(e, qpos=q, qvel=0.7 * e.qvel, ctrl=1.2 * e.ctrl)
+        changed.append(e)
+    other = traced(planted(("coulomb_friction", "large")), replace(data, episodes=changed)).to_json()
+    mine = report.to_json()
+    for e in (mine, other):
+        # A finding about a test run is one about the data; none may come of the others.
+        e["findings"] = [f for f in e["findings"] if not f["where"].startswith(tuple(report.runs["test"]))]
+    assert {key for key in mine if json.dumps(mine[key]) != json.dumps(other[key])} <= TESTED
+    assert mine["before"] != other["before"]
+    assert mine["after"] != other["after"]
+
+
+def test_a_split_column_is_honoured() -> None:
+    p = planted(("coulomb_friction", "large"))
+    names = [e.run for e in p.measurements.episodes]
+    report = traced(p, parted(p.measurements, ["test", "train", "train", "select", "train", "test"]))
+    assert report.runs == {"train": [names[1], names[2], names[4]], "select": [names[3]], "test": [names[0], names[5]]}
+    assert report.verdict == "explained"
+
+
+@pytest.mark.slow
+def test_with_fewer_than_three_training_runs_blocks_are_selected_on_and_it_says_so() -> None:
+    p = planted(("coulomb_friction", "large"), episodes=3)
+    report = traced(p)
+    assert report.runs["select"] == []
+    assert len(report.runs["train"]) == 2
+    said = [f.message for f in report.findings if f.kind == "split"]
+    assert any("windows of the training runs" in message and "block" in message for message in said)
+    assert [t.label for t in report.effects] == ["coulomb_friction(hinge)"]
+
+
+@pytest.mark.xfail(
+    strict=True, raises=ValueError, reason="all other blocks lie beside the judged one: its fold has nothing to fit"
+)
+def test_a_single_run_is_traced_and_reported_as_not_held_out() -> None:
+    p = planted(("coulomb_friction", "large"))
+    one = replace(p.measurements, episodes=p.measurements.episodes[:1])
+    report = traced(p, one)
+    assert report.runs["test"] == []
+    assert any("no test data" in f.message for f in report.findings)
+    assert "fitted runs" in str(report)
+    assert np.isfinite(report.after[0].rmse).all()
+
+
+def test_progress_goes_forward() -> None:
+    p, shares = planted(), []
+    trace(p.xml, p.measurements, p.declared, candidates=KINDS, threads=1, progress=lambda s, what: shares.append(s))
+    assert shares == sorted(shares)
+    assert shares[0] > 0
+    assert shares[-1] < 1.0 + 1e-9
+
+
+def test_the_model_may_be_given_as_a_specification() -> None:
+    p = planted()
+    report = trace(mujoco.MjSpec.from_string(p.xml), p.measurements, p.declared, candidates=KINDS, threads=1)
+    assert report.to_json() == complete(1).to_json()
+
+
+@pytest.mark.xfail(
+    strict=True, raises=ValueError, reason="derivatives of a simulation without any parameter fail to reshape"
+)
+def test_nothing_declared_and_no_candidates_is_a_check_of_the_model() -> None:
+    report = trace(compiled(), recorded(), candidates=[], threads=1)
+    assert report.verdict == "complete"
+
+
+@pytest.mark.xfail(
+    strict=True, raises=np.linalg.LinAlgError, reason="see test_screen: no declared parameter has influence"
+)
+def test_a_declared_parameter_that_the_data_cannot_show_stops_nothing() -> None:
+    from sb3_rpto.effects.forces import TorqueOffset
+
+    samples = 600
+    data = recorded([TorqueOffset("hinge", offset=0.2)], duration=3.0, commands=np.zeros((5, samples)), episodes=5)
+    report = trace(compiled(), data, ["motor.gear"], candidates=["torque_offset"], threads=1)
+    assert [t.label for t in report.effects] == ["torque_offset(hinge)"]
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+def test_an_unknown_declared_name_is_refused_with_the_near_ones() -> None:
+    p = planted()
+    with pytest.raises(ValueError, match=r"hinge\.dampign.*damping"):
+        trace(p.xml, p.measurements, ["hinge.dampign"])
+    with pytest.raises(ValueError, match=r"no object 'pol'.*pole"):
+        trace(p.xml, p.measurements, ["pol.mass"])
+    with pytest.raises(TypeError, match="list of names"):
+        trace(p.xml, p.measurements, "hinge.damping")
+
+
+def test_joints_and_actuators_that_the_model_lacks_are_refused() -> None:
+    p = planted()
+    with pytest.raises(ValueError, match="hinge"):
+        trace(p.xml.replace('name="hinge"', 'name="elbow"'), p.measurements)
+    with pytest.raises(ValueError, match="motor"):
+        trace(p.xml.replace('name="motor"', 'name="drive"'), p.measurements)
+
+
+def test_joints_that_the_data_lack_are_refused() -> None:
+    with pytest.raises(ValueError, match="axle"):
+        trace(compiled(WITH_WHEEL), recorded(), threads=1)
+
+
+def test_an_unknown_kind_of_candidate_is_refused_with_the_known_ones() -> None:
+    p = planted()
+    with pytest.raises(ValueError, match=r"coulom_friction.*coulomb_friction"):
+        traced(p, kinds=["coulom_friction"])
+
+
+def test_too_long_a_horizon_is_refused() -> None:
+    p = planted()
+    with pytest.raises(ValueError, match="lower horizon"):
+        trace(p.xml, p.measurements, p.declared, candidates=KINDS, horizon=30.0, threads=1)
+
+
+def test_too_few_samples_are_refused_in_words() -> None:
+    t = np.arange(6) / 200
+    table = {"time": t, "qpos.hinge": np.sin(t), "ctrl.motor": 0 * t}
+    data = Measurements.from_tables({"a": table, "b": {**table, "qpos.hinge": np.cos(t)}})
+    with pytest.raises(ValueError, match=r"few|short|longer|longest"):
+        trace(planted().xml, data, candidates=KINDS, threads=1)
+
+
+# --- a gymnasium environment ------------------------------------------------------------------------------------------
+
+
+def driven(friction: float) -> tuple[gym.Env, Measurements]:
+    """Random pushes of the double pendulum, whose cart has dry friction, in a replay buffer, and the nominal env."""
+    env, nominal = (gym.make("InvertedDoublePendulum-v5") for _ in range(2))
+    env.unwrapped.model.dof_frictionloss[0] = friction
+    buffer = ReplayBuffer(2000, env.observation_space, env.action_space, "cpu")
+    rng = np.random.default_rng(0)
+    obs, _ = env.reset(seed=0)
+    action, low, high = np.zeros(1), env.action_space.low, env.action_space.high
+    for k in range(700):
+        if k % 2 == 0:
+            action = rng.uniform(-1, 1, 1)
+        after, reward, terminated, truncated, _ = env.step((low + (action + 1) / 2 * (high - low)).astype(np.float32))
+        buffer.add(obs, after, action[None], np.array([reward]), np.array([terminated or truncated]), [{}])
+        obs = after if not (terminated or truncated) else env.reset()[0]
+    return nominal, Measurements.from_replay(buffer, nominal)
+
+
+def test_an_unchanged_environment_is_complete_without_error() -> None:
+    env, data = driven(0.0)
+    report = trace(env, data, candidates=KINDS, threads=1)
+    assert data.exact
+    assert report.verdict == "complete"
+    assert all(np.all(e.rmse < 1e-4) for e in report.before)
+    assert report.floor == []
+
+
+def test_dry_friction_that_an_environment_lacks_is_found() -> None:
+    env, data = driven(1.0)
+    report = trace(env, data, candidates=KINDS, threads=1)
+    assert report.verdict in ("explained", "partly explained")
+    labels = {t.label: t for t in report.effects}
+    assert "coulomb_friction(slider)" in labels
+    assert labels["coulomb_friction(slider)"].effect.values[0] == pytest.approx(1.0, rel=0.1)
+    corrected = report.apply(env)
+    assert corrected.unwrapped.model.dof_frictionloss[0] == pytest.approx(1.0, rel=0.1)
+    assert env.unwrapped.model.dof_frictionloss[0] == 0
