@@ -40,6 +40,10 @@ class Payload(Effect):
         p = along[:, None] * c
         total = m + added
         new = (m[:, None] * c + added[:, None] * p) / total[:, None]
+        if not world.model.body_ipos[self.index].any():
+            # At the centre of mass a point only weighs; MuJoCo keeps some such bodies in a simplified form.
+            mass[heavier, self.index] = total
+            return
         tensor = to_tensor(inertia[heavier, self.index], frame[heavier, self.index])
         tensor += spread(m, c - new) + spread(added, p - new)
         mass[heavier, self.index], centre[heavier, self.index] = total, new

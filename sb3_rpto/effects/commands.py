@@ -1,10 +1,12 @@
-"""What happens to a command on its way to the actuator, in this order: delay, deadband, gain, saturation, play, lag."""
+"""What happens to a command on its way to the actuator, in this order: delay, deadband, saturation, play, lag, gain."""
 
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from sb3_rpto.effects.effect import Effect, Parameter, register
+from sb3_rpto.effects.world import World
 
 _LONGEST = 0.2  # s; a longer delay is a fault of the log
 
@@ -57,19 +59,25 @@ class CommandDeadband(Effect):
 
 @register
 class CommandGain(Effect):
-    r"""A wrong gain of the amplifier: :math:`(1 + g)\,u`."""
+    r"""A wrong gain of the amplifier: :math:`(1 + g)\,u`, after the controller's own limits; MuJoCo's ``gainprm``."""
 
     kind = "command_gain"
     place = "actuator"
     parameters = (Parameter("change", "", 0.03, lower=-0.9, upper=9.0),)
     equation = "(1 + change) u"
+    native = "gainprm"
     excite = "large commands"
-    order = 2
     same = ("gain", "gear", "strength")
 
-    def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
-        """Scale."""
-        return u * (1 + x[:, 0])
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Actuators whose force is linear in their gain parameters."""
+        linear = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
+        return [name for i, name in enumerate(super().places(model)) if model.actuator_gaintype[i] in linear]
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Scale the gain."""
+        world.field("actuator_gainprm")[:, self.index, :3] *= 1 + x
 
 
 @register

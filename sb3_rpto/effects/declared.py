@@ -98,7 +98,7 @@ _KINDS: dict[str, dict[str, _Kind]] = {
     },
     "body": {
         "mass": _Kind("kg", *_column("body_mass")[:1], _write_mass, lambda s: 0.05 * s.mass, _POSITIVE),
-        "inertia": _Kind("kg·m²", *_column("body_inertia", 0)[:1], _write_inertia, lambda s: s.inertia, _POSITIVE),
+        "inertia": _Kind("kg·m²", *_column("body_inertia", 0)[:1], _write_inertia, lambda s: s.inertia, (0.03, 30.0)),
         "length": _Kind("m", link_length, write_length, lambda s: 0.1, (0.5, 2.0)),
     },
     "geom": {"friction": _Kind("", *_column("geom_friction", 0), lambda s: 0.1)},

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import binom
 
 from sb3_rpto.tracing.identify import Fit, Problem
 
 #: R may exceed one by so much: the noise is estimated, too.
 TOLERANCE = 0.06
-#: Level of the upper quantile that is watched beside the median: saturation is rare and hides in medians.
-UPPER = 0.9
+#: Saturation is rare and hides in medians: windows are counted whose error exceeds by a quarter what noise alone
+#: exceeds in one of a hundred. More than twice as many as that, beyond chance, are too many.
+BEYOND, RARE, CHANCE = 1.25, 0.02, 1e-3
 RESAMPLES = 400
 
 
@@ -22,20 +24,20 @@ class Adequacy:
     :param ratio: of the medians
     :param low: 2.5 % quantile over resampled blocks
     :param high: 97.5 % quantile
-    :param upper: the same ratio of the 90 % quantiles
-    :param upper_low: its 2.5 % quantile
+    :param strays: share of windows whose error noise does not explain
+    :param chance: of as many of them by noise alone
     """
 
     ratio: float
     low: float
     high: float
-    upper: float
-    upper_low: float
+    strays: float
+    chance: float
 
     @property
     def adequate(self) -> bool:
-        """Whether both ratios reach down to one, within the tolerance of the noise estimate."""
-        return self.low <= 1 + TOLERANCE and self.upper_low <= 1 + 2 * TOLERANCE
+        """Whether the ratio reaches down to one, within the tolerance of the noise estimate, with few stray windows."""
+        return self.low <= 1 + TOLERANCE and self.chance > CHANCE
 
     def __str__(self) -> str:
         return f"R = {self.ratio:.2f} [{self.low:.2f}, {self.high:.2f}]"
@@ -48,21 +50,22 @@ def adequacy(problem: Problem, fit: Fit, seed: int) -> Adequacy:
     :param fit: those starts
     """
     noise = problem.noise_errors(fit, seed)
-    typical, rare = float(np.median(noise)), float(np.quantile(noise, UPPER))
+    typical = float(np.median(noise))
     rng = np.random.default_rng(seed)
     blocks = problem.windows.block
     names = np.unique(blocks)
     members = [np.flatnonzero(blocks == b) for b in names]
-    medians, uppers = [], []
+    medians = []
     for _ in range(RESAMPLES):
         rows = np.concatenate([members[i] for i in rng.integers(len(names), size=len(names))])
         medians.append(np.median(fit.errors[rows]))
-        uppers.append(np.quantile(fit.errors[rows], UPPER))
     low, high = np.quantile(medians, [0.025, 0.975]) / typical
+    stray = fit.errors > BEYOND * np.quantile(noise, 0.99)
+    count = int(stray.sum()) if len(np.unique(blocks[stray])) > 1 else 0
     return Adequacy(
         float(np.median(fit.errors)) / typical,
         float(low),
         float(high),
-        float(np.quantile(fit.errors, UPPER)) / rare,
-        float(np.quantile(uppers, 0.025)) / rare,
+        float(stray.mean()),
+        float(binom.sf(count - 1, len(stray), RARE)),
     )

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.effects.effect import Effect
@@ -30,7 +32,7 @@ class Fit:
     :param values: all parameters of the simulation, (p,)
     :param starts: corrections of the windows' starts, in units of their spread, (W, 2 nv)
     :param errors: root mean squared residual of each window in units of the noise, (W,)
-    :param cost: robust cost
+    :param cost: robust cost, comparable between fits of like size only
     """
 
     values: np.ndarray
@@ -51,6 +53,30 @@ class Linear:
     normal: np.ndarray
     gradient: np.ndarray
     free: np.ndarray
+
+
+class Loss(NamedTuple):
+    """Soft-L1, and how firmly the starts are held.
+
+    :param clip: where the loss of a residual turns linear: at three typical ones, at least three units of noise
+    """
+
+    clip: float
+
+    @property
+    def hold(self) -> float:
+        """Weight of the starts: where the model errs by more than noise, they must not make up for it."""
+        return (self.clip / 3) ** 2
+
+    @classmethod
+    def of(cls, r: np.ndarray) -> Loss:
+        """The loss that fits residuals of this size."""
+        return cls(3 * max(1.0, 1.4826 * float(np.median(np.abs(r)))))
+
+    def energy(self, r: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        """Robust sum of squares of each window with its start, (..., W)."""
+        soft = 2 * self.clip**2 * (np.sqrt(1 + (r / self.clip) ** 2) - 1)
+        return soft.sum(-1) + self.hold * (starts**2).sum(-1)
 
 
 class Problem:
@@ -143,22 +169,22 @@ class Problem:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residuals and their derivatives by the free parameters (in plausible sizes) and by the start.
 
-        :param values: (p,)
+        :param values: (p,), or (W, p) for parameters of its own in each window (then none may be free)
         :param starts: (W, 2 nv)
         :param free: (f,) indices
         :return: (W, R), (W, R, f), (W, R, x)
         """
         count, f, x = len(self.windows), len(free), len(self.moving)
-        columns = 1 + f + x
-        all_values = np.tile(values, (columns, count, 1))
+        columns, p = 1 + f + x, values.shape[-1]
+        all_values = np.tile(np.broadcast_to(values, (count, p)), (columns, 1, 1))
         all_starts = np.tile(starts, (columns, 1, 1))
-        step = self.steps(values)[free]
+        step = self.steps(values)[free] if f else np.empty(0)
         for i, parameter in enumerate(free):
             all_values[1 + i, :, parameter] += step[i]
         for i, coordinate in enumerate(self.moving):
             all_starts[1 + f + i, :, coordinate] += 0.3
         index = np.tile(np.arange(count), columns)
-        r = self.residuals(all_values.reshape(-1, len(values)), all_starts.reshape(columns * count, -1), index)
+        r = self.residuals(all_values.reshape(columns * count, p), all_starts.reshape(columns * count, -1), index)
         r = r.reshape(columns, count, -1)
         by_values = (r[1 : 1 + f] - r[0]) * (self.size[free] / step)[:, None, None]
         by_start = (r[1 + f :] - r[0]) / 0.3
@@ -168,27 +194,26 @@ class Problem:
 
     # --- fits ---------------------------------------------------------------------------------------------------
 
-    def reduce(self, r: np.ndarray, jt: np.ndarray, jx: np.ndarray, starts: np.ndarray, clip: float) -> _Reduced:
+    def reduce(self, r: np.ndarray, jt: np.ndarray, jx: np.ndarray, starts: np.ndarray, loss: Loss) -> _Reduced:
         """Weighted normal equations of each window with its start eliminated (Schur complement)."""
-        weight = 1 / np.sqrt(1 + (r / clip) ** 2)  # soft-L1, as iterated least squares
+        weight = 1 / np.sqrt(1 + (r / loss.clip) ** 2)
         wt = jt * weight[:, :, None]
-        htt, gt = np.einsum("wrf,wrg->wfg", wt, jt), np.einsum("wrf,wr->wf", wt, r)
-        if not jx.shape[2]:
-            return _Reduced(htt, gt, np.zeros((len(r), 0, jt.shape[2])), np.zeros((len(r), 0)))
-        wx = jx * weight[:, :, None]
-        prior = hold(clip)
-        hxx = np.einsum("wrx,wry->wxy", wx, jx) + prior * np.eye(jx.shape[2])
-        hxt, gx = np.einsum("wrx,wrf->wxf", wx, jt), np.einsum("wrx,wr->wx", wx, r) + prior * starts[:, self.moving]
-        gain, move = np.linalg.solve(hxx, hxt), np.linalg.solve(hxx, gx[:, :, None])[:, :, 0]
-        normal = htt - np.einsum("wxf,wxg->wfg", hxt, gain)
-        gradient = gt - np.einsum("wxf,wx->wf", hxt, move)
+        normal, gradient = np.einsum("wrf,wrg->wfg", wt, jt), np.einsum("wrf,wr->wf", wt, r)
+        gain, move = np.zeros((len(r), jx.shape[2], jt.shape[2])), np.zeros((len(r), jx.shape[2]))
+        if jx.shape[2]:
+            wx = jx * weight[:, :, None]
+            hxx = np.einsum("wrx,wry->wxy", wx, jx) + loss.hold * np.eye(jx.shape[2])
+            hxt = np.einsum("wrx,wrf->wxf", wx, jt)
+            gx = np.einsum("wrx,wr->wx", wx, r) + loss.hold * starts[:, self.moving]
+            gain, move = np.linalg.solve(hxx, hxt), np.linalg.solve(hxx, gx[:, :, None])[:, :, 0]
+            normal = normal - np.einsum("wxf,wxg->wfg", hxt, gain)
+            gradient = gradient - np.einsum("wxf,wx->wf", hxt, move)
         return _Reduced(normal, gradient, gain, move)
 
-    def cost(self, r: np.ndarray, starts: np.ndarray, values: np.ndarray, clip: float) -> np.ndarray:
+    def cost(self, r: np.ndarray, starts: np.ndarray, values: np.ndarray, loss: Loss) -> np.ndarray:
         """Robust cost of one or more candidates: r (..., W, R), starts (..., W, 2 nv), values (..., p)."""
-        soft = 2 * clip**2 * (np.sqrt(1 + (r / clip) ** 2) - 1)
         pull = np.where(self.declared, 0.0, (values - self.null) / self.size / RIDGE) ** 2
-        return soft.sum((-1, -2)) + hold(clip) * (starts**2).sum((-1, -2)) + pull.sum(-1)
+        return loss.energy(r, starts).sum(-1) + pull.sum(-1)
 
     def fit(
         self,
@@ -211,12 +236,12 @@ class Problem:
         starts = np.zeros((len(self.windows), 2 * self.simulation.model.nv)) if starts is None else starts.copy()
         for _ in range(iterations):
             r, jt, jx = self.linearise(values, starts, free)
-            clip = robust_scale(r)
-            now = float(self.cost(r, starts, values, clip))
-            reduced = self.reduce(r, jt, jx, starts, clip)
+            loss = Loss.of(r)
+            now = float(self.cost(r, starts, values, loss))
+            reduced = self.reduce(r, jt, jx, starts, loss)
             for dampings in (damping * np.array([0.1, 1.0, 10.0, 100.0]), damping * np.array([1e4, 1e6])):
                 trial = self._try(values, starts, free, reduced, dampings if len(free) else dampings[:1])
-                costs = self.cost(trial.residuals, trial.starts, trial.values, clip)
+                costs = self.cost(trial.residuals, trial.starts, trial.values, loss)
                 best = int(np.argmin(costs))
                 if costs[best] < now:
                     break
@@ -226,7 +251,7 @@ class Problem:
             damping = float(np.clip(dampings[best], 1e-6, 1e6))
             if now - costs[best] < tolerance * now:
                 break
-        return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, robust_scale(r))))
+        return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, Loss.of(r))))
 
     def _try(
         self, values: np.ndarray, starts: np.ndarray, free: np.ndarray, reduced: _Reduced, dampings: np.ndarray
@@ -262,12 +287,28 @@ class Problem:
     def linear(self, fit: Fit, free: np.ndarray) -> Linear:
         """The reduced normal equations at a fit, for screening, elimination and intervals."""
         r, jt, jx = self.linearise(fit.values, fit.starts, free)
-        reduced = self.reduce(r, jt, jx, fit.starts, robust_scale(r))
+        reduced = self.reduce(r, jt, jx, fit.starts, Loss.of(r))
         return Linear(reduced.normal, reduced.gradient, free)
 
     def score(self, values: np.ndarray, iterations: int = 2) -> Fit:
-        """Errors of the windows with the parameters given, (p,), and their starts fitted."""
-        return self.fit(values, np.empty(0, dtype=int), iterations=iterations, tolerance=1e-2)
+        """Errors of the windows with the parameters given and their starts fitted.
+
+        :param values: (p,), or (W, p) for parameters of its own in each window
+        """
+        count, none = len(self.windows), np.empty(0, dtype=int)
+        starts = np.zeros((count, 2 * self.simulation.model.nv))
+        rows = np.broadcast_to(values, (count, values.shape[-1]))
+        best = self.residuals(rows, starts, np.arange(count))
+        for _ in range(iterations if len(self.moving) else 0):
+            r, jt, jx = self.linearise(values, starts, none)
+            loss = Loss.of(r)
+            trial = starts.copy()
+            trial[:, self.moving] -= self.reduce(r, jt, jx, starts, loss).move
+            now = self.residuals(rows, trial, np.arange(count))
+            better = loss.energy(now, trial) < loss.energy(r, starts)
+            starts = np.where(better[:, None], trial, starts)
+            best = np.where(better[:, None], now, r)
+        return Fit(values, starts, self.errors(best), float(Loss.of(best).energy(best, starts).sum()))
 
     def noise_errors(self, fit: Fit, seed: int, draws: int = 8) -> np.ndarray:
         """Errors that a true model would have: white noise, less what the fitted starts take of it, (draws, W)."""
@@ -301,32 +342,27 @@ class _Trial:
     residuals: np.ndarray  # (t, W, R)
 
 
-def robust_scale(r: np.ndarray) -> float:
-    """Where the soft-L1 loss turns linear: three typical residuals, at least three units of noise."""
-    return 3 * max(1.0, 1.4826 * float(np.median(np.abs(r))))
-
-
-def hold(clip: float) -> float:
-    """How firmly the starts are held: where the model errs by more than noise, they must not make up for it."""
-    return (clip / 3) ** 2
-
-
 def bounded_step(normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Minimise the quadratic within a box by holding what leaves it; exact for a diagonal matrix."""
-    held = np.zeros(len(gradient), dtype=bool)
-    step = np.zeros(len(gradient))
-    for _ in range(len(gradient) + 1):
-        go = ~held
-        if not go.any():
-            break
-        rhs = -(gradient[go] + normal[np.ix_(go, held)] @ step[held])
-        step[go] = np.linalg.lstsq(normal[np.ix_(go, go)], rhs, rcond=1e-12)[0]
-        out = go & ((step < low) | (step > high))
-        if not out.any():
-            break
-        step[out] = np.clip(step[out], low[out], high[out])
-        held |= out
-    return step
+    """Minimise the quadratic z' N z / 2 + g' z within a box.
+
+    :param normal: positive semi-definite, (f, f)
+    :param gradient: (f,)
+    :param low: (f,), may be -inf
+    :param high: (f,)
+    """
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scaled = normal / scale[:, None] / scale
+    values, vectors = np.linalg.eigh(scaled)
+    # Half of it as a least-squares problem: root' root = N, root' rhs = -g.
+    root = np.sqrt(np.maximum(values, 1e-12 * values.max()))[:, None] * vectors.T
+    rhs = -(vectors.T @ (gradient / scale)) / np.sqrt(np.maximum(values, 1e-12 * values.max()))
+    step = np.linalg.lstsq(root, rhs, rcond=None)[0] / scale
+    if np.all((step >= low) & (step <= high)):
+        return step
+    # A box that is a point asks for no solver.
+    wide = np.maximum(high - low, 1e-9 * np.maximum(1.0, np.abs(low)))
+    found = lsq_linear(root, rhs, (low * scale, (low + wide) * scale), method="bvls")
+    return np.clip(found.x / scale, low, high)
 
 
 def interpolate(
@@ -380,10 +416,8 @@ class Typical:
     def at(self, effect: Effect) -> Scales:
         """The scales where a bound effect sits."""
         total = float(self.mass.sum())
-        rest = Scales(
-            *(float(getattr(self, n).max(initial=1e-9)) for n in ("torque", "velocity", "command", "inertia", "span")),
-            total,
-        )
+        names = ("torque", "velocity", "command", "inertia", "span")
+        rest = Scales(**{n: float(getattr(self, n).max(initial=1e-9)) for n in names}, mass=total)
         if effect.place in ("joint", "sensor"):
             at = {n: float(getattr(self, n)[effect.dof]) for n in ("torque", "velocity", "inertia", "span")}
             return replace(rest, **at)

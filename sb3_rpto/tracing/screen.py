@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_rpto.tracing.identify import Fit, Problem
+from sb3_rpto.tracing.identify import Fit, Loss, Problem
 
 #: A candidate of plausible size that moves all residuals together by less than this many units of noise is not excited.
 EXCITED = 4.0
@@ -44,14 +44,15 @@ def screen(problem: Problem, fit: Fit) -> Screening:
     simulation = problem.simulation
     strength = np.flatnonzero(simulation.strength)
     r, jt, jx = problem.linearise(fit.values, fit.starts, strength)
-    reduced = problem.reduce(0 * r, jt, jx, fit.starts, clip=3.0)
+    # As if the model fitted: what noise alone would let the data show.
+    reduced = problem.reduce(0 * r, jt, jx, 0 * fit.starts, Loss(3.0))
     known = problem.declared[strength]
     c = np.flatnonzero(~known)
     perp = _orthogonal(reduced.normal.sum(0), known)
     # Near an unstable pose everything grows alike: each window has the same say in what looks like what.
     size = np.maximum(np.einsum("wff->f", reduced.normal), 1e-12)
     share = np.einsum("wff,f->w", reduced.normal, 1 / size)
-    even = _orthogonal((reduced.normal / (share + 1e-3 * share.mean())[:, None, None]).sum(0), known)
+    even = _orthogonal((reduced.normal / (share + 1e-3 * share.mean() + 1e-12)[:, None, None]).sum(0), known)
     count = len(simulation.effects)
     groups = [np.flatnonzero(np.isin(strength[c], np.arange(s.start, s.stop))) for s in simulation.slices]
     sensitivity, cosine = np.zeros(count), np.eye(count)
@@ -74,7 +75,7 @@ def _orthogonal(normal: np.ndarray, known: np.ndarray) -> np.ndarray:
     if not len(d):
         return normal
     # Declared parameters that the data leave open must not hide anything: a small ridge holds them.
-    inner = normal[np.ix_(d, d)] + 1e-9 * np.trace(normal[np.ix_(d, d)]) * np.eye(len(d))
+    inner = normal[np.ix_(d, d)] + (1e-9 * np.trace(normal[np.ix_(d, d)]) + 1e-12) * np.eye(len(d))
     return normal[np.ix_(c, c)] - normal[np.ix_(c, d)] @ np.linalg.solve(inner, normal[np.ix_(d, c)])
 
 

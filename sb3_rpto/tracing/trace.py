@@ -21,7 +21,7 @@ from sb3_rpto.tracing.model_checks import check_against
 from sb3_rpto.tracing.report import Candidate, Report, Traced
 from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary, typical
 from sb3_rpto.tracing.screen import Screening, screen
-from sb3_rpto.tracing.select import Model, Selection, Selector, folds
+from sb3_rpto.tracing.select import Model, Selection, Selector
 from sb3_rpto.tracing.windows import Windows, cut, noise_levels, time_step
 
 #: The 95 % quantile of the largest t on complete data; see docs/tracing.md for the sets that it comes from.
@@ -32,7 +32,7 @@ TRAIN, SELECT = 48, 48
 OVERLAP = 2 / 3
 #: Seconds of training data that count as short.
 SHORT = 15.0
-#: Fewer windows than this are used for both, by cross-validation.
+#: Fewer windows than this overlap.
 FEW = 40
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
@@ -201,17 +201,13 @@ def join(a: Windows, b: Windows) -> Windows:
         enabled=enabled,
         settings={k: np.concatenate([v, b.drive.settings[k]]) for k, v in a.drive.settings.items()},
     )
-    return Windows(
-        both("qpos"),
-        both("qvel"),
-        both("spread"),
-        drive,
-        *(np.concatenate([pad(getattr(w, n)) for w in (a, b)]) for n in ("at", "measured", "usable")),
-        a.sigma,
-        a.columns,
-        np.concatenate([a.block, b.block + a.block.max() + 1]),
-        np.concatenate([a.episode, b.episode + a.episode.max() + 1]),
-        both("time"),
+    return replace(
+        a,
+        drive=drive,
+        **{n: both(n) for n in ("qpos", "qvel", "spread", "time")},
+        **{n: np.concatenate([pad(getattr(w, n)) for w in (a, b)]) for n in ("at", "measured", "usable")},
+        block=np.concatenate([a.block, b.block + a.block.max() + 1]),
+        episode=np.concatenate([a.episode, b.episode + a.episode.max() + 1]),
     )
 
 
@@ -253,7 +249,7 @@ def _horizon(data: Measurements) -> float:
 def _windows(
     model: mujoco.MjModel, train: Measurements, select: Measurements, sigma: np.ndarray, horizon: float
 ) -> tuple[Windows, Windows | None, str]:
-    """Windows to fit and to select on; without runs for that, blocks of the training runs, or folds of few windows."""
+    """Windows to fit and to select on; None to select on where no runs are set apart: then blocks take turns."""
     if select.episodes:
         return cut(model, train, sigma, horizon, TRAIN), cut(model, select, sigma, horizon, SELECT), ""
     every = cut(model, train, sigma, horizon, TRAIN + SELECT)
@@ -261,13 +257,10 @@ def _windows(
         every = cut(model, train, sigma, horizon, 2 * FEW, overlap=OVERLAP)
         if len(np.unique(every.block)) < 3:
             raise ValueError(
-                f"the training runs hold {len(every)} window(s) of {horizon:g} s in fewer than three blocks of a second: "
-                "too few to select on; record longer, or lower horizon"
+                f"the training runs hold {len(every)} window(s) of {horizon:g} s in fewer than three blocks of a "
+                "second: too few to select on; record longer, or lower horizon"
             )
-        return every, None, f"selected on {len(every)} windows of the training runs by cross-validation over blocks"
-    fit, judge_ = folds(every, 4, horizon)[0]
-    message = f"selected on {len(judge_)} windows of the training runs, in blocks, with a gap of one window"
-    return every.take(fit), every.take(judge_), message
+    return every, None, f"selected on {len(every)} windows of the training runs by cross-validation over blocks"
 
 
 def _report(state: dict[str, Any]) -> Report:

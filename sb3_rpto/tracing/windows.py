@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import mujoco
 import numpy as np
@@ -64,16 +64,9 @@ class Windows:
 
     def take(self, index: np.ndarray) -> Windows:
         """The windows at ``index``."""
-        return Windows(
-            *(getattr(self, name)[index] for name in ("qpos", "qvel", "spread")),
-            self.drive.take(index),
-            *(getattr(self, name)[index] for name in ("at", "measured", "usable")),
-            self.sigma,
-            self.columns,
-            self.block[index],
-            self.episode[index],
-            self.time[index],
-        )
+        shared = ("drive", "sigma", "columns")
+        own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in shared}
+        return replace(self, drive=self.drive.take(index), **own)
 
 
 def noise_levels(data: Measurements) -> np.ndarray:
