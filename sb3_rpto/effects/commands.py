@@ -1,4 +1,7 @@
-"""What happens to a command on its way to the actuator, in this order: delay, deadband, saturation, play, lag, gain."""
+"""What happens to a command on its way to the actuator, in this order: delay, deadband, saturation, play, lag.
+
+A wrong gain comes last of all, in the actuator itself.
+"""
 
 from typing import Any
 
@@ -72,7 +75,8 @@ class CommandGain(Effect):
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
         """Actuators whose force is linear in their gain parameters."""
-        linear = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
+        # Plain numbers: NumPy's integers are not found among MuJoCo's enumerators.
+        linear = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
         return [name for i, name in enumerate(super().places(model)) if model.actuator_gaintype[i] in linear]
 
     def write(self, world: World, x: np.ndarray) -> None:

@@ -359,9 +359,10 @@ def bounded_step(normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high
     step = np.linalg.lstsq(root, rhs, rcond=None)[0] / scale
     if np.all((step >= low) & (step <= high)):
         return step
-    # A box that is a point asks for no solver.
-    wide = np.maximum(high - low, 1e-9 * np.maximum(1.0, np.abs(low)))
-    found = lsq_linear(root, rhs, (low * scale, (low + wide) * scale), method="bvls")
+    # The solver wants boxes with an inside.
+    least = np.nan_to_num(low, neginf=-1e9)
+    top = np.maximum(high, least + 1e-9 * (1 + np.abs(least)))
+    found = lsq_linear(root, rhs, (low * scale, top * scale), method="bvls")
     return np.clip(found.x / scale, low, high)
 
 

@@ -7,10 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.tracing.identify import Fit, Problem, bounded_step
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.windows import Windows
 
+#: t*: the 95 % quantile of the largest t on complete data; see docs/tracing.md for the sets that it comes from.
+THRESHOLD = 3.5
 #: Effects must lower the typical window error by this share to stay.
 GAIN = 0.03
 #: Iterations of a refit that begins at the larger model's optimum.
@@ -89,13 +92,13 @@ class Selection:
     :param model: what is kept
     :param evidence: for each kept effect, by index
     :param alike: effects that could stand for a kept one, by index
-    :param dropped: the step, gain and t at which an effect was dropped, by index
+    :param dropped: the step, and the gain and t of what was dropped in it, by index
     """
 
     model: Model
     evidence: dict[int, Evidence] = field(default_factory=dict)
     alike: dict[int, list[int]] = field(default_factory=dict)
-    dropped: dict[int, tuple[int, Evidence | None]] = field(default_factory=dict)
+    dropped: dict[int, tuple[int, Evidence]] = field(default_factory=dict)
 
 
 class Selector:
@@ -113,12 +116,33 @@ class Selector:
         self, train: Problem, select: Problem | None, threshold: float, say: Say, horizon: float = 0.0
     ) -> None:
         self.train, self.select, self.threshold, self.say = train, select, threshold, say
+        self.horizon = horizon
         self.folds = [] if select else folds(train.windows, FOLDS, horizon)
         self.blocks = (
             select.windows.block if select else np.concatenate([train.windows.block[b] for _, b in self.folds])
         )
         self.simulation = train.simulation
         self._memory: dict[tuple[int, ...], Model] = {}
+
+    @classmethod
+    def on(
+        cls,
+        simulation: Simulation,
+        windows: tuple[Windows, Windows | None],
+        scales: Sequence[Scales],
+        horizon: float,
+        progress: Callable[[float, str], None],
+    ) -> Selector:
+        """For the shipped threshold and windows to train and to select on."""
+        select = None if windows[1] is None else Problem(simulation, windows[1], scales)
+        return cls(
+            Problem(simulation, windows[0], scales), select, THRESHOLD, lambda what: progress(0.6, what), horizon
+        )
+
+    @property
+    def judging(self) -> Problem:
+        """Where adequacy is judged: the select windows, or all where there are none."""
+        return self.select or self.train
 
     def free(self, effects: Sequence[int]) -> np.ndarray:
         """Indices of the parameters of the declared and of the given effects."""
@@ -177,12 +201,8 @@ class Selector:
         """What ``with_`` gains over ``without`` on the select windows."""
         return compare(without.errors, with_.errors, self.blocks)
 
-    def eliminate(self, full: Model, base: Model) -> Selection:
-        """Drop the effect whose removal costs least until all that remain are needed.
-
-        :param full: all candidates
-        :param base: the declared parameters alone
-        """
+    def eliminate(self, full: Model) -> Selection:
+        """Drop the effect whose removal costs least until all that remain are needed."""
         current, step = full, 0
         outcome = Selection(full)
         while current.effects:
@@ -197,7 +217,7 @@ class Selector:
                 if not evidence.clear(self.threshold):
                     reduced = trial
                     for e in drop:
-                        outcome.dropped[e] = (step, evidence if len(drop) == 1 else None)
+                        outcome.dropped[e] = (step, evidence)
                     break
             if reduced is None:
                 break

@@ -13,6 +13,7 @@ from sb3_rpto.effects import LIBRARY, Declared, Effect, Simulation, declare
 from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.tracing.adequacy import Adequacy, adequacy
+from sb3_rpto.tracing.calibrate import calibrated
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Fit, Problem, scales_for
@@ -24,10 +25,11 @@ from sb3_rpto.tracing.screen import Screening, screen
 from sb3_rpto.tracing.select import Model, Selection, Selector
 from sb3_rpto.tracing.windows import Windows, cut, noise_levels, time_step
 
-#: The 95 % quantile of the largest t on complete data; see docs/tracing.md for the sets that it comes from.
-THRESHOLD = 3.5
 #: Most windows to fit, and to select on.
-TRAIN, SELECT = 48, 48
+TRAIN, SELECT = 40, 40
+#: Longest integration steps in s for measured data: at a reversal dry friction errs by up to a step, and half a radian
+#: a second per millisecond is easily seen. Eliminating effects is content with the coarse one.
+FINE, COARSE = 0.001, 0.002
 #: Few windows overlap by this share.
 OVERLAP = 2 / 3
 #: Seconds of training data that count as short.
@@ -78,25 +80,22 @@ def trace(
     findings += [f for f in train.findings if f not in findings]
     fitted = replace(data, episodes=train.episodes + select.episodes)
     sigma = noise_levels(fitted)
+    horizon = horizon or _horizon(fitted)
     nominal = compiled.__copy__()
-    nominal.opt.timestep = time_step(nominal, data)
+    nominal.opt.timestep = time_step(nominal, data, FINE)
     known = declare(nominal, declared)
     effects: list[Effect] = [*known, *_candidates(nominal, [d.label for d in known], candidates)]
     simulation = Simulation(nominal, effects, threads)
-    base_residuals = force_residuals(simulation, simulation.null, fitted)
-    scales = scales_for(effects, typical(simulation, base_residuals))
-    horizon = horizon or _horizon(fitted)
-    train_windows, select_windows, shared = _windows(nominal, train, select, sigma, horizon)
-    if shared:
-        findings.append(Finding("split", "training runs", shared))
-    fitting = Problem(simulation, train_windows, scales)
-    judging = fitting if select_windows is None else Problem(simulation, select_windows, scales)
+    scales = scales_for(effects, typical(simulation, force_residuals(simulation, simulation.null, fitted)))
+    windows = _windows(nominal, train, select, sigma, horizon)
+    if windows[1] is None:
+        message = f"selected on {len(windows[0])} windows of the training runs by cross-validation over blocks"
+        findings.append(Finding("split", "training runs", message))
+    selector = Selector.on(simulation, windows, scales, horizon, say)
+    judging = selector.judging
 
     say(0.05, "fitting the declared parameters")
-    apart = None if select_windows is None else judging
-    selector = Selector(fitting, apart, THRESHOLD, lambda what: say(0.6, what), horizon)
-    before = fit_declared(selector, seed)
-    base = selector.model((), before)
+    base = selector.model((), fit_declared(selector, seed))
     before = base.fit
     first = adequacy(judging, judging.score(before.values), seed)
     screening: Screening | None = None
@@ -104,13 +103,21 @@ def trace(
     last = first
     if not first.adequate:
         say(0.15, "screening the candidates")
-        screening = screen(fitting, before)
-        selector.threshold = THRESHOLD
-        selection = search(selector, base, screening, say)
+        screening = screen(selector.train, before)
+        coarse = compiled.__copy__()
+        coarse.opt.timestep = time_step(coarse, data, COARSE)
+        rough = Selector.on(
+            Simulation(coarse, effects, threads), _windows(coarse, train, select, sigma, horizon), scales, horizon, say
+        )
+        if calibrate:
+            say(0.2, f"calibrating on {calibrate} complete sets")
+            t = calibrated(rough, rough.model((), base.fit).fit, worth_fitting(selector, screening), calibrate, seed)
+            selector.threshold = rough.threshold = t
+        selection = search(selector, rough, base, screening, say)
         last = adequacy(judging, judging.score(selection.model.fit.values), seed)
 
     say(0.85, "fitting the final model")
-    joined = train_windows if select_windows is None else join(train_windows, select_windows)
+    joined = windows[0] if windows[1] is None else join(windows[0], windows[1])
     final, intervals = refit(selection, Problem(simulation, joined, scales), seed)
     verdict = judge(first, last, bool(selection.model.effects))
     say(0.9, "predicting the test runs")
@@ -136,22 +143,31 @@ def fit_declared(selector: Selector, seed: int) -> Fit:
     return best
 
 
-def search(selector: Selector, base: Model, screening: Screening, say: Progress) -> Selection:
-    """Joint fit of all excited candidates, elimination backwards, substitution by like ones, a last look forward."""
-    simulation = selector.simulation
+def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
+    """The excited candidates, one of each class."""
     chosen: list[int] = []
-    for i, effect in enumerate(simulation.effects):
+    for i, effect in enumerate(selector.simulation.effects):
         if effect.kind == "declared" or not screening.excited(i):
             continue
         if not any(j in chosen for j in screening.alike(i)):
             chosen.append(i)
+    return chosen
+
+
+def search(selector: Selector, rough: Selector, base: Model, screening: Screening, say: Progress) -> Selection:
+    """Joint fit of all excited candidates, elimination backwards, a last look forward, substitution by like ones.
+
+    :param selector: fine steps, for what is decided in the end
+    :param rough: coarse steps, for the elimination: it costs most
+    :param base: the declared parameters alone
+    """
+    chosen = worth_fitting(selector, screening)
     say(0.2, f"fitting {len(chosen)} candidates together")
-    full = selector.together(chosen, base.fit)
-    selection = selector.eliminate(full, base)
-    selection = selector.add_back(selection, chosen)
+    selection = rough.eliminate(rough.together(chosen, rough.model((), base.fit).fit))
+    selection = rough.add_back(selection, chosen)
     say(0.7, "trying like effects in their place")
-    selection = selector.substitute(selection, screening)
-    return selector.judge(selection)
+    selection.model = selector.model(selection.model.effects, selection.model.fit, iterations=10)
+    return selector.judge(selector.substitute(selection, screening))
 
 
 def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 200) -> tuple[np.ndarray, np.ndarray]:
@@ -248,10 +264,10 @@ def _horizon(data: Measurements) -> float:
 
 def _windows(
     model: mujoco.MjModel, train: Measurements, select: Measurements, sigma: np.ndarray, horizon: float
-) -> tuple[Windows, Windows | None, str]:
+) -> tuple[Windows, Windows | None]:
     """Windows to fit and to select on; None to select on where no runs are set apart: then blocks take turns."""
     if select.episodes:
-        return cut(model, train, sigma, horizon, TRAIN), cut(model, select, sigma, horizon, SELECT), ""
+        return cut(model, train, sigma, horizon, TRAIN), cut(model, select, sigma, horizon, SELECT)
     every = cut(model, train, sigma, horizon, TRAIN + SELECT)
     if len(every) < FEW:
         every = cut(model, train, sigma, horizon, 2 * FEW, overlap=OVERLAP)
@@ -260,7 +276,7 @@ def _windows(
                 f"the training runs hold {len(every)} window(s) of {horizon:g} s in fewer than three blocks of a "
                 "second: too few to select on; record longer, or lower horizon"
             )
-    return every, None, f"selected on {len(every)} windows of the training runs by cross-validation over blocks"
+    return every, None
 
 
 def _report(state: dict[str, Any]) -> Report:
@@ -351,10 +367,6 @@ def _candidate(
         return Candidate(effect.label, "not excited", f"to see it: {effect.excite}", sensitivity, alike)
     if i in selection.dropped:
         step, evidence = selection.dropped[i]
-        why = (
-            "hardly matters in the joint fit"
-            if evidence is None
-            else (f"removal costs {evidence.gain:+.1%} of the error (t = {evidence.t:.1f})")
-        )
+        why = f"removal costs {evidence.gain:+.1%} of the error (t = {evidence.t:.1f})"
         return Candidate(effect.label, "dropped", f"step {step}: {why}", sensitivity, alike)
     return Candidate(effect.label, "dropped", f"looks like {alike[0]}" if alike else "not fitted", sensitivity, alike)

@@ -22,8 +22,6 @@ MEMORY = 0.25
 EXACT = 1e-4
 #: Least length of a block of windows in s; blocks count as independent.
 BLOCK = 1.0
-#: Longest integration step in s for measured data.
-FINEST = 0.001
 #: Half the time, in s, over which the state at a window's start is smoothed, and the fewest samples on each side.
 HALF_WIDTH, HALF_COUNT = 0.025, 4
 
@@ -122,13 +120,13 @@ def smoothed_state(episode: Episode, index: int, sigma: np.ndarray) -> tuple[np.
     return coefficients[0], coefficients[1] / scale, spread / np.array([[1.0], [scale]])
 
 
-def time_step(model: mujoco.MjModel, data: Measurements) -> float:
-    """Integration step for the data in s: the model's own for exact data, else a whole fraction of it below 1 ms.
+def time_step(model: mujoco.MjModel, data: Measurements, longest: float) -> float:
+    """Integration step for the data in s: the model's own for exact data, else a whole fraction of it.
 
-    At a reversal dry friction errs by up to a step: half a radian a second per millisecond is easily seen.
+    :param longest: that it may have
     """
     h = float(model.opt.timestep)
-    return h if data.exact else h / math.ceil(h / FINEST - 1e-9)
+    return h if data.exact else h / math.ceil(h / longest - 1e-9)
 
 
 def cut(
