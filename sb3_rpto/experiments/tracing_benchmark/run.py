@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import random
 import re
 import subprocess
 import sys
@@ -80,6 +81,8 @@ def run(
     folder = Path(out) / "cases"
     folder.mkdir(parents=True, exist_ok=True)
     pending = [case for case in cases if not resume or stored(folder, case) is None]
+    # In mixed order an unfinished run is a fair sample, and its time left an honest guess.
+    random.Random(0).shuffle(pending)
     commit, count = _commit(), min(workers or os.cpu_count() or 1, max(1, len(pending)))
     say = _Progress(len(pending))
     if count == 1:
