@@ -2,11 +2,23 @@
 
 from collections.abc import Iterator
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 
-from sb3_rpto.effects import LIBRARY, Drive, Effect, Parameter, Simulation, World, candidates, from_json, register
+from sb3_rpto.effects import (
+    LIBRARY,
+    Drive,
+    Effect,
+    Parameter,
+    Scales,
+    Simulation,
+    World,
+    candidates,
+    from_json,
+    register,
+)
 
 XML = """
 <mujoco>
@@ -70,6 +82,42 @@ def test_all_can_be_simulated_together() -> None:
     start = np.zeros((3, 2)), np.ones((3, 2))
     plain = Simulation(compiled, [], 1).rollout(np.empty((3, 0)), *start, drive)
     np.testing.assert_array_equal(sim.rollout(np.tile(sim.null, (3, 1)), *start, drive)[0], plain[0])
+
+
+def test_a_task_with_bodies_in_a_simplified_form_can_have_all_of_them_at_size() -> None:
+    """MuJoCo refuses to recompute a body that it knows to have its centre of mass at its origin when that moves."""
+    compiled = gym.make("Reacher-v5").unwrapped.model
+    effects = candidates(compiled)
+    assert {e.on for e in effects if e.kind == "payload"} == {"body0", "body1", "fingertip", "target"}
+    sim = Simulation(compiled, effects, 1)
+    sizes = np.concatenate([[p.size_for(Scales()) for p in e.parameters] for e in effects])
+    bounds = np.array([(p.lower, p.upper) for e in effects for p in e.parameters]).T
+    drive = Drive(np.random.default_rng(0).uniform(-1, 1, (2, 20, 2)))
+    start = np.tile(compiled.qpos0 + 0.1, (2, 1)), np.ones((2, compiled.nv))
+    plain = sim.rollout(np.tile(sim.null, (2, 1)), *start, drive)[0]
+    for s in sim.slices:
+        values = np.tile(sim.null, (2, 1))
+        values[0, s] = np.clip(sim.null + sizes, *bounds)[s]
+        q = sim.rollout(values, *start, drive)[0]
+        assert np.isfinite(q).all()
+        np.testing.assert_array_equal(q[1], plain[1])
+    together = sim.rollout(np.tile(np.clip(sim.null + 0.1 * sizes, *bounds), (2, 1)), *start, drive)[0]
+    assert np.isfinite(together).all()
+    assert not np.allclose(together, plain)
+
+
+def test_a_payload_at_a_body_whose_centre_is_its_origin_only_weighs() -> None:
+    ball = """<mujoco><worldbody><body name="b"><joint axis="0 1 0" pos="0 0 1"/><geom size=".1" mass="1"/></body>
+    </worldbody></mujoco>"""
+    compiled = mujoco.MjModel.from_xml_string(ball)
+    sim = Simulation(compiled, [LIBRARY["payload"]("b")], 1)
+    got = sim.rollout(np.array([[0.5, 3.0]]), np.array([[0.4]]), np.zeros((1, 1)), Drive(np.zeros((1, 50, 0))))
+    compiled.body_mass[1] = 1.5  # and its inertia stays
+    mujoco.mj_setConst(compiled, mujoco.MjData(compiled))
+    expected = Simulation(compiled, [], 1).rollout(
+        np.empty((1, 0)), np.array([[0.4]]), np.zeros((1, 1)), Drive(np.zeros((1, 50, 0)))
+    )
+    np.testing.assert_allclose(got[0], expected[0], rtol=1e-12)
 
 
 def test_without_contacts_gravity_or_memoryless_motors() -> None:

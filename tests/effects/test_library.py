@@ -275,9 +275,39 @@ def test_delay_equation() -> None:
 
 def test_other_command_equations() -> None:
     np.testing.assert_allclose(sent("command_deadband", RAMP, width=0.8), [0, 0.2, 1.2, 0.7, -0.2, -2.2, 0])
-    np.testing.assert_allclose(sent("command_gain", RAMP, change=0.1), 1.1 * RAMP)
     np.testing.assert_allclose(sent("command_saturation", RAMP, inverse_limit=0.8), np.clip(RAMP, -1.25, 1.25))
     np.testing.assert_allclose(sent("backlash", RAMP, half_width=0.6), [0.5, 0.5, 1.4, 1.4, -0.4, -2.4, -0.4])
+
+
+def test_gain_is_of_the_command_after_its_limits() -> None:
+    """The same as larger commands, whatever the force is of a command; a limit of the controller comes before it."""
+    xml = """<mujoco><option timestep="0.004"/><worldbody><body><joint name="j" axis="0 1 0" damping="0.1"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".03"/></body></worldbody><actuator>ACTUATOR</actuator></mujoco>"""
+    commands = np.random.default_rng(1).uniform(-2, 2, (2, 80, 1))
+    start = np.array([[0.3], [-0.5]]), np.array([[1.0], [-2.0]])
+    for actuator in (
+        '<motor name="m" joint="j" gear="3"/>',
+        '<motor name="m" joint="j" ctrlrange="-1 1"/>',
+        '<position name="m" joint="j" kp="8" kv="0.3" forcerange="-6 6"/>',
+        '<general name="m" joint="j" gaintype="affine" gainprm="2 .5 -.3" biastype="affine" biasprm=".1 -2 .2"/>',
+        '<general name="m" joint="j" gainprm="2" dyntype="filterexact" dynprm="0.05" actearly="true"/>',
+    ):
+        model = mujoco.MjModel.from_xml_string(xml.replace("ACTUATOR", actuator))
+        sim = Simulation(model, [LIBRARY["command_gain"]("m")], 1)
+        got = sim.rollout(np.array([[0.25], [-0.4]]), *start, Drive(commands))[0]
+        limit = np.inf
+        if model.actuator_ctrllimited[0]:
+            limit, model.actuator_ctrllimited[0] = 1.0, False
+        larger = np.clip(commands, -limit, limit) * np.array([1.25, 0.6])[:, None, None]
+        plain = Simulation(model, [], 1).rollout(np.empty((2, 0)), *start, Drive(larger))[0]
+        np.testing.assert_allclose(got, plain, rtol=1e-9, atol=1e-12)
+
+
+def test_gain_sits_where_the_force_is_linear_in_it() -> None:
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body>
+    </worldbody><actuator><motor name="plain" joint="j"/><muscle name="pull" joint="j" lengthrange="0 1"/>
+    <general name="affine" joint="j" gaintype="affine" gainprm="2 .5 0"/></actuator></mujoco>""")
+    assert LIBRARY["command_gain"].places(model) == ["plain", "affine"]
 
 
 def test_lag_is_filterexact() -> None:

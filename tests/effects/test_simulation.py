@@ -154,18 +154,59 @@ def test_commands_before_the_start_fill_delays() -> None:
 
 
 def test_commands_pass_the_chain_in_its_order() -> None:
-    """A saturation after a gain, whatever the order of the list."""
+    """A saturation after a dead zone, whatever the order of the list."""
     qpos, qvel, commands = start(2)
     chain: list[Effect] = [
         LIBRARY["command_saturation"]("m1", inverse_limit=2.0),
-        LIBRARY["command_gain"]("m1", change=0.5),
+        LIBRARY["command_deadband"]("m1", width=0.2),
     ]
-    sent = commands.copy()
-    sent[..., 0] = np.clip(1.5 * commands[..., 0], -0.5, 0.5)
+    sent, u = commands.copy(), commands[..., 0]
+    sent[..., 0] = np.clip(u - np.clip(u, -0.2, 0.2), -0.5, 0.5)
     for effects in (chain, chain[::-1]):
         sim = Simulation(MODEL, effects, 1)
         got = sim.rollout(np.tile(sim.values(), (2, 1)), qpos, qvel, Drive(commands))
         assert equal(got, loop(MODEL, qpos, qvel, sent))
+
+
+def test_a_gain_comes_after_the_chain() -> None:
+    qpos, qvel, commands = start(2)
+    chain = [LIBRARY["command_gain"]("m1", change=0.5), LIBRARY["command_saturation"]("m1", inverse_limit=2.0)]
+    sent = commands.copy()
+    sent[..., 0] = 1.5 * np.clip(commands[..., 0], -0.5, 0.5)
+    sim = Simulation(MODEL, chain, 1)
+    got = sim.rollout(np.tile(sim.values(), (2, 1)), qpos, qvel, Drive(commands))
+    for a, b in zip(got, loop(MODEL, qpos, qvel, sent)):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+
+
+def test_dry_friction_of_the_models_own_keeps_its_constraint() -> None:
+    """What presses hardly changes hardly anything: no effect makes such a joint stiffer by merely being there."""
+    qpos, qvel, commands = start(3)
+    small = {
+        "torque_offset": {"offset": 1e-9},
+        "coulomb_friction": {"level": 1e-9},
+        "stribeck_friction": {"extra": 1e-9, "level": 1e-9},
+        "load_friction": {"mu": 1e-9},
+    }
+    expected = loop(MODEL, qpos, qvel, commands)
+    for kind, values in small.items():
+        sim = Simulation(MODEL, [LIBRARY[kind]("shoulder", **values)], 1)
+        assert equal(sim.rollout(np.tile(sim.null, (3, 1)), qpos, qvel, Drive(commands)), expected)
+        got = sim.rollout(np.tile(sim.values(), (3, 1)), qpos, qvel, Drive(commands))
+        for a, b in zip(got, expected):
+            assert 0 < np.abs(a - b).max() < 1e-6, kind
+
+
+@pytest.mark.parametrize("kind", ["coulomb_friction", "stribeck_friction", "load_friction"])
+def test_dry_friction_on_a_smooth_joint_is_the_stiff_one_from_nothing_on(kind: str) -> None:
+    """The elbow has none of its own: as little as can be is as good as nothing, although its constraint is stiff."""
+    qpos, qvel, commands = start(3)
+    sim = Simulation(MODEL, [LIBRARY[kind]("elbow")], 1)
+    values = np.tile(sim.null, (3, 1))
+    plain = sim.rollout(values, qpos, qvel, Drive(commands))
+    values[:, 0] = 1e-9
+    for a, b in zip(sim.rollout(values, qpos, qvel, Drive(commands)), plain):
+        assert 0 < np.abs(a - b).max() < 1e-6
 
 
 def test_spring_adds_to_the_models_own() -> None:
