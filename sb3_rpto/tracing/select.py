@@ -22,6 +22,10 @@ REFIT = 5
 TRIFLE = 0.01
 #: Most folds of a cross-validation.
 FOLDS = 6
+#: t from which on a bundle of effects is not dropped at once.
+BUNDLE = 1.5
+#: Rounds of the look forward, and candidates fitted in each.
+ROUNDS, PROMISING = 4, 6
 #: Candidates for a substitution are the likest so many.
 SUBSTITUTES = 5
 
@@ -214,7 +218,9 @@ class Selector:
                 trial = self.model([e for e in current.effects if e not in drop], current.fit)
                 evidence = self.evidence(current, trial)
                 self.say(f"{len(trial.effects)} effects left")
-                if not evidence.clear(self.threshold):
+                # Many at once must not take something along: they go where nothing at all is seen of it.
+                limit = self.threshold if len(drop) == 1 else min(BUNDLE, self.threshold)
+                if not evidence.clear(limit):
                     reduced = trial
                     for e in drop:
                         outcome.dropped[e] = (step, evidence)
@@ -251,7 +257,7 @@ class Selector:
             best = e
             alike: list[int] = []
             for other in others:
-                self.say(f"{self.simulation.effects[e].kind} or {self.simulation.effects[other].kind}")
+                self.say(f"{self.simulation.effects[e].label} or {self.simulation.effects[other].label}")
                 trial = self.model([i for i in current.effects if i != best] + [other], current.fit, REFIT + 3)
                 loses = self.evidence(current, trial)
                 if self.evidence(trial, current).clear(self.threshold):
@@ -288,21 +294,27 @@ class Selector:
             selection.model = self.model([i for i in current.effects if i != worst], current.fit)
 
     def add_back(self, selection: Selection, candidates: Sequence[int]) -> Selection:
-        """One look forward: an effect that the elimination dropped may be needed after all."""
-        current = selection.model
-        outside = [c for c in candidates if c not in current.effects]
-        if not outside:
-            return selection
-        gains = self._promise(current, outside)
-        for e in sorted(outside, key=lambda e: -gains[e])[:3]:
-            if gains[e] < GAIN * current.fit.cost:
+        """The look forward: where much is missing, the joint fit may end far from the best; add what is clearly needed.
+
+        Each round fits the effects that promise most one by one and keeps the best, if it is clear.
+        """
+        for _ in range(ROUNDS):
+            current = selection.model
+            outside = [c for c in candidates if c not in current.effects]
+            gains = self._promise(current, outside) if outside else {}
+            tried: list[tuple[float, Model, int]] = []
+            for e in sorted(outside, key=lambda e: -gains[e])[:PROMISING]:
+                if gains[e] < GAIN * current.fit.cost:
+                    break
+                self.say(f"looking at {self.simulation.effects[e].label} again")
+                trial = self.model([*current.effects, e], current.fit, REFIT + 3)
+                evidence = self.evidence(trial, current)
+                if evidence.clear(self.threshold):
+                    tried.append((evidence.gain, trial, e))
+            if not tried:
                 break
-            trial = self.model([*current.effects, e], current.fit, REFIT + 3)
-            self.say(f"looking at {self.simulation.effects[e].kind} again")
-            if self.evidence(trial, current).clear(self.threshold):
-                current = trial
-                selection.dropped.pop(e, None)
-        selection.model = current
+            _, selection.model, added = max(tried, key=lambda found: found[0])
+            selection.dropped.pop(added, None)
         return selection
 
     def _promise(self, model: Model, outside: Sequence[int]) -> dict[int, float]:
@@ -352,6 +364,6 @@ def _ends(s: slice) -> tuple[int, int]:
 
 
 def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:
-    """What to try to drop: all that hardly matter at once, half of them, then the cheapest three one by one."""
-    bundles = [trifles, trifles[: len(trifles) // 2]] if len(trifles) > 1 else []
+    """What to try to drop: all that hardly matter at once, a half or a quarter of them, the cheapest three each."""
+    bundles = [trifles, trifles[: len(trifles) // 2], trifles[: len(trifles) // 4]] if len(trifles) > 1 else []
     return [b for b in bundles if len(b) > 1] + [[e] for e in order[:3]]

@@ -98,7 +98,12 @@ def _difference_noise(episodes: Sequence[Episode], column: int, order: int) -> f
         gaps = gaps / np.abs(gaps).max(axis=(1, 2), keepdims=True)
         weights = 1 / np.prod(np.where(np.eye(order + 1, dtype=bool), 1.0, gaps), axis=2)
         found.append((weights * q).sum(1) / np.sqrt((weights**2).sum(1)))
-    return float(np.median(np.abs(np.concatenate(found)))) / 0.6745 if found else 0.0
+    if not found:
+        return 0.0
+    # The smallest 95 % leave out the peaks of motion; what they lack of a Gaussian's variance is known. A median would
+    # know but a few values of a rounded signal.
+    squares = np.sort(np.concatenate(found) ** 2)
+    return float(np.sqrt(squares[: max(1, round(0.95 * len(squares)))].mean() / 0.7588))
 
 
 def smoothed_state(episode: Episode, index: int, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
