@@ -116,9 +116,6 @@ def test_a_declared_parameter_without_influence_hides_nothing() -> None:
     assert found[0, 0] == pytest.approx(rest @ rest)
 
 
-@pytest.mark.xfail(
-    strict=True, raises=np.linalg.LinAlgError, reason="the ridge is zero when no declared parameter has influence"
-)
 def test_declared_parameters_of_which_none_has_influence_hide_nothing() -> None:
     j = np.random.default_rng(0).standard_normal((40, 2))
     j[:, 0] = 0
@@ -136,3 +133,22 @@ def test_sensitivity_is_the_size_of_the_influence_in_units_of_noise() -> None:
     assert found[0] / found[1] == pytest.approx(4.0, rel=0.35)
     _, jt, _ = fine.linearise(fine.null, np.zeros((len(fine.windows), 2)), np.array([0]))
     assert 0 < found[0] <= np.sqrt(np.sum(jt**2))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("names", [(), ("motor.gear",), ("hinge.damping", "motor.gear")])
+def test_what_nothing_moves_divides_nothing_by_zero(names: tuple[str, ...]) -> None:
+    """Neither a joint at rest, nor a motor without commands, nor windows in which nothing happens at all."""
+    effects: list[Effect] = [CoulombFriction("hinge"), ViscousFriction("hinge"), CommandGain("motor")]
+    data = recorded(commands=0 * constant(), start=(0.0, 0.0))
+    found, _ = screened([*effects, *declare(compiled(), names)], data)
+    assert np.isfinite(found.sensitivity).all()
+    assert np.isfinite(found.cosine).all()
+    assert not found.excited(2)
+    wheel = compiled(WITH_WHEEL)
+    p = problem(
+        [CoulombFriction("axle"), ViscousFriction("axle"), *declare(wheel, names)], recorded(model=wheel), wheel
+    )
+    found = screen(p, at_null(p))
+    assert np.isfinite(found.cosine).all()
+    assert not found.excited(0)

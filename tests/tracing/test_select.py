@@ -5,13 +5,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from simulated import problem, recorded
+from simulated import compiled, problem, recorded
 
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, ViscousFriction
 from sb3_rpto.tracing.screen import screen
-from sb3_rpto.tracing.select import GAIN, Evidence, Selection, Selector, compare
+from sb3_rpto.tracing.select import GAIN, Evidence, Selection, Selector, compare, folds
+from sb3_rpto.tracing.windows import cut
 
 THRESHOLD = 3.5
 COULOMB, OFFSET, DRAG = 0, 1, 2
@@ -28,7 +29,7 @@ def eliminated(s: Selector) -> Selection:
     count = range(len(s.simulation.effects))
     base = s.model((), s.train.score(s.train.null))
     full = s.together(list(count), base.fit)
-    return s.eliminate(full, base)
+    return s.eliminate(full)
 
 
 @cache
@@ -200,3 +201,56 @@ def test_evidence_is_judged_on_the_select_windows_alone() -> None:
     other = Selector(s.train, s.select, THRESHOLD, s.say)
     worse = replace(selection.model, errors=2 * base.errors)
     assert other.evidence(worse, base).gain == pytest.approx(1 - 2)
+
+
+# --- cross-validation -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("overlap", [0.0, 2 / 3])
+def test_folds_are_whole_blocks_and_a_gap_apart_from_what_is_fitted(overlap: float) -> None:
+    horizon = 0.4
+    data = recorded(episodes=2, duration=6.1)
+    w = cut(compiled(), data, np.array([1e-3]), horizon, 100, overlap=overlap)
+    parts = folds(w, 4, horizon)
+    assert len(parts) == 4
+    np.testing.assert_array_equal(np.sort(np.concatenate([judged for _, judged in parts])), np.arange(len(w)))
+    for others, judged in parts:
+        assert len(others)
+        assert set(w.block[judged]) & set(np.delete(w.block, judged)) == set()
+        apart = np.abs(w.time[others][:, None] - w.time[judged])
+        apart[w.episode[others][:, None] != w.episode[judged]] = np.inf
+        # No sample of a judged window, nor one within a window's length of it, is fitted to.
+        assert apart.min() >= 2 * horizon - 1e-6
+
+
+def test_few_blocks_are_as_many_folds_and_never_without_something_to_fit() -> None:
+    data = recorded(episodes=1, duration=2.6)
+    w = cut(compiled(), data, np.array([1e-3]), 0.4, 100)
+    count = len(np.unique(w.block))
+    parts = folds(w, 6, 0.4)
+    assert len(parts) == count < 6
+    assert all(len(others) and len(judged) for others, judged in parts)
+    assert all(set(others) & set(judged) == set() for others, judged in parts)
+
+
+def test_a_fold_is_judged_as_by_a_fit_to_the_others() -> None:
+    """One Gauss-Newton step from the fit to all windows is nearly that fit."""
+    effects: list[Effect] = [CoulombFriction("hinge"), TorqueOffset("hinge")]
+    p = problem(effects, recorded([CoulombFriction("hinge", level=0.05)], episodes=3, noise=2e-3), noise=2e-3)
+    s = Selector(p, None, THRESHOLD, lambda what: None, 0.4)
+    full = s.model((0, 1), p.score(p.null), 20)
+    assert len(s.folds) == 6
+    expected, inside = [], []
+    for others, judged in s.folds:
+        refitted = p.on(others).fit(full.fit.values, np.arange(2), iterations=4, tolerance=1e-4)
+        expected.append(p.on(judged).score(refitted.values).errors)
+        inside.append(p.on(judged).score(full.fit.values).errors)
+    order = np.concatenate([judged for _, judged in s.folds])
+    assert len(full.errors) == len(order)
+    # What the windows themselves would have pulled the parameters to is left out, as a refit leaves it out.
+    step, refit = full.errors - np.concatenate(inside), np.concatenate(expected) - np.concatenate(inside)
+    assert np.corrcoef(step, refit)[0, 1] > 0.95
+    assert np.linalg.norm(step - refit) < 0.3 * np.linalg.norm(refit)
+    assert refit.mean() > 0
+    assert s.evidence(full, s.model((1,), full.fit)).clear(THRESHOLD)
+    assert not s.evidence(full, s.model((0,), full.fit)).clear(THRESHOLD)
