@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.signal import savgol_filter
 
 MIN_ROWS = 5
@@ -13,8 +14,11 @@ GAP = 5.0
 JITTER = 0.05
 """Time is called jittered when 5 % of the steps are off the median by more than this fraction of it."""
 SLOPE = (0.8, 1.25)
-"""Slopes of measured velocity against differentiated position that pass for one."""
+"""Slopes of measured velocity against the position's change that pass for one."""
+SPAN = 16
+"""Samples over which velocity and change of position are compared."""
 WINDOW = 9
+"""Samples of the filter that differentiates positions."""
 
 
 @dataclass(frozen=True)
@@ -109,16 +113,27 @@ def quantum(velocity: np.ndarray) -> float | None:
 
 
 def velocity_slope(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> float | None:
-    """Least-squares slope, through the origin, of a measured velocity against the differentiated position.
+    """Slope of a measured velocity against the position's change: of all that the noise leaves open, the nearest to 1.
+
+    The velocity's integral over :data:`SPAN` samples is compared with the position's change over them, where both are
+    large against their noise. The least-squares slope on a noisy quantity is too small, and that of the inverse
+    regression too large: the true one lies between them (Frisch 1934).
 
     :param time: increasing times in s, shape (T,)
     :param position: shape (T,)
     :param velocity: shape (T,)
-    :return: 1 for consistent channels, negative for a flipped sign; None where the joint hardly moved against its noise
+    :return: 1 for consistent channels, negative for a flipped sign; None where the joint hardly moved against its
+        noise, or where the two have less than a quarter of their variance in common
     """
     # Third differences remove the motion and scale white noise by sqrt(1 + 9 + 9 + 1).
     noise = float(np.std(np.diff(position, 3))) / np.sqrt(20)
     if np.ptp(position) <= 50 * noise or np.ptp(position) < 1e-9:
         return None
-    reference = smoothed_velocity(time, position)
-    return float(reference @ velocity / (reference @ reference))
+    span = min(SPAN, len(time) // 2)
+    integral = cumulative_trapezoid(velocity, time, initial=0)
+    moved, said = (x[span:] - x[:-span] for x in (position, integral))
+    square, product = moved @ moved, moved @ said
+    if product**2 <= 0.25 * square * (said @ said):
+        return None
+    low, high = sorted((product / square, (said @ said) / product))
+    return float(np.clip(1.0, low, high))

@@ -204,6 +204,6 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
         )
         say(
             kind,
-            f"slope against the differentiated position is {slope:.2f}, not 1: {cause}; kept as it is",
+            f"slope against the position's change is {slope:.2f}, not 1: {cause}; kept as it is",
             f"qvel.{name}",
         )

@@ -1,5 +1,6 @@
 import builtins
 import gzip
+import re
 from itertools import chain
 from pathlib import Path
 
@@ -8,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_rpto.experiments.planting import generate
 from sb3_rpto.tracing import Measurements
-from sb3_rpto.tracing.checks import quantum, smoothed_velocity, split_at_gaps, unwrap, velocity_slope
+from sb3_rpto.tracing.checks import SLOPE, quantum, smoothed_velocity, split_at_gaps, unwrap, velocity_slope
 from sb3_rpto.tracing.columns import read_columns
 
 MEASURED = Path(__file__).parents[3] / "shared" / "measured"
@@ -273,12 +275,56 @@ def test_velocity_against_position_is_reported(factor, kind):
     table["qvel.hinge"] *= factor
     data = Measurements.from_tables({"a": table})
     assert kinds(data) == [kind]
-    assert f"{factor:.2f}" in data.findings[0].message
+    said = re.search(r"slope .* is (-?[0-9.]+), not 1", data.findings[0].message)
+    assert float(said[1]) == pytest.approx(factor, rel=2e-4)
+
+
+@pytest.mark.parametrize("system", ["cartpole", "reacher", "arm3"])
+@pytest.mark.parametrize("setting", [{}, {"jitter": 0.5}, {"rate": 50.0}, {"quantum": 2 * np.pi / 4096}])
+def test_right_but_noisy_velocities_of_gentle_motion_have_no_finding(system, setting):
+    """Noise of the differentiated position is no fault of the velocity."""
+    data = generate(system, [], seed=1, episodes=4, duration=3.0, noise=5e-3, **setting).measurements
+    assert not {"velocity slope", "flipped velocity"} & set(kinds(data))
+    slopes = [velocity_slope(e.time, e.qpos[:, j], e.qvel[:, j]) for e in data.episodes for j in range(e.qpos.shape[1])]
+    np.testing.assert_allclose([s for s in slopes if s is not None], 1.0, atol=0.05)
+    assert len([s for s in slopes if s is not None]) > 0.7 * len(slopes)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.5, 0.7, 1.5, 180 / np.pi])
+def test_wrong_velocities_of_noisy_motion_are_all_found(factor):
+    for e in generate("reacher", [], seed=1, episodes=4, duration=3.0, noise=5e-3).measurements.episodes:
+        for q, v in zip(e.qpos.T, e.qvel.T):
+            slope = velocity_slope(e.time, q, factor * v)
+            assert slope == pytest.approx(factor, rel=0.1)
+            assert not SLOPE[0] <= slope <= SLOPE[1]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, 1.0, 1.5])
+def test_the_slope_is_the_bound_nearest_to_one(noise):
+    """The inverse regression's slope is too large by the noise's share of the integral's variance."""
+    rng, time, h, span = np.random.default_rng(0), np.arange(20000) * 0.01, 0.01, 16
+    velocity = 0.6 * np.cos(time) + noise * rng.normal(size=len(time))
+    signal = np.mean((0.6 * 2 * np.sin(span * h / 2) * np.cos(time)) ** 2)
+    expected = 0.6 * (1 + noise**2 * h**2 * (span - 0.5) / signal)
+    assert velocity_slope(time, np.sin(time), velocity) == pytest.approx(min(expected, 1.0), rel=0.02)
+
+
+def test_a_slow_filter_is_no_wrong_slope():
+    time = np.arange(2000) * 0.01
+    assert velocity_slope(time, np.sin(time), np.cos(time - 0.4)) == 1.0
+
+
+def test_velocities_that_have_nothing_to_do_with_the_position_are_not_judged():
+    time = np.arange(2000) * 0.01
+    assert velocity_slope(time, np.sin(time), np.random.default_rng(0).normal(size=2000)) is None
+    assert velocity_slope(time, np.sin(time), np.zeros(2000)) is None
 
 
 def test_slope_of_a_resting_joint_is_not_judged():
     rng = np.random.default_rng(0)
-    assert velocity_slope(np.arange(200) * 0.01, rng.normal(size=200) * 1e-3, rng.normal(size=200)) is None
+    for n in (5, 6, 20, 200):
+        assert velocity_slope(np.arange(n) * 0.01, rng.normal(size=n) * 1e-3, rng.normal(size=n)) is None
+        assert velocity_slope(np.arange(n) * 0.01, np.ones(n), rng.normal(size=n)) is None
 
 
 def test_duplicate_is_dropped_and_reported():
