@@ -1,0 +1,81 @@
+"""The examples that are short enough to run."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from sb3_rpto.effects.carry import load_corrected
+from sb3_rpto.tracing import Measurements
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+SMALL = ["--episodes", "6", "--duration", "2.5"]
+
+
+@pytest.fixture
+def trace_robot(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("trace_robot", EXAMPLES / "trace_robot.py")
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "trace_robot", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def run(module: ModuleType, monkeypatch: pytest.MonkeyPatch, out: Path, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["trace_robot.py", "--out", str(out), *SMALL, *arguments])
+    module.main()
+
+
+def test_trace_robot_names_what_is_in_the_robot(trace_robot, monkeypatch, tmp_path, capsys):
+    label, effect, _ = trace_robot.robot(seed=0)[3].open()
+    assert label == "actuator_lag(motor)"
+    look = trace_robot.Envelope.open
+    opened_after = []
+
+    def watched(envelope):
+        opened_after.append(sorted(p.name for p in tmp_path.iterdir()))
+        return look(envelope)
+
+    monkeypatch.setattr(trace_robot.Envelope, "open", watched)
+    run(trace_robot, monkeypatch, tmp_path, "--candidates", "actuator_lag,torque_offset")
+    assert opened_after == [["effects.json", "log", "model.xml", "report.html", "report.json"]]
+    found = json.loads((tmp_path / "report.json").read_text())
+    assert [e["label"] for e in found["effects"]] == [label]
+    assert found["effects"][0]["parameters"]["time_constant"]["value"] == pytest.approx(effect.values[0], rel=0.25)
+    assert [e.label for e in load_corrected(tmp_path).effects if e.kind != "declared"] == [label]
+    out = capsys.readouterr().out
+    assert out.index("verdict:") < out.index("the envelope says: actuator_lag(motor)") < out.index("named itself")
+    assert "MISSED" not in out
+
+
+def test_trace_robot_writes_logs_that_tell_no_more_than_a_robots_would(trace_robot, tmp_path):
+    data, xml, declared, _ = trace_robot.robot(seed=3, episodes=2, duration=0.5)
+    trace_robot.write_log(data, tmp_path)
+    files = sorted(tmp_path.iterdir())
+    assert [f.name for f in files] == ["run00.csv", "run01.csv"]
+    assert {f.read_text().splitlines()[0] for f in files} == {"time,qpos.hinge,qvel.hinge,ctrl.motor"}
+    read = Measurements.from_csv(tmp_path / "*.csv")
+    np.testing.assert_allclose(read.episodes[1].qpos, data.episodes[1].qpos, atol=1e-6)
+    assert trace_robot.robot(seed=4, episodes=2, duration=0.5)[1:3] == (xml, declared)
+
+
+def test_trace_robot_draws_by_seed(trace_robot):
+    def inside(seed: int, library: bool) -> tuple[str, bool]:
+        label, effect, _ = trace_robot.robot(seed, 1, 0.1, library)[3].open()
+        return label, effect is not None
+
+    robots = [inside(seed, True) for seed in range(40)]
+    assert robots == [inside(seed, True) for seed in range(40)]
+    assert len(set(robots)) > 12
+    assert all(known for _, known in robots)
+    assert not any(inside(seed, False)[1] for seed in range(5))
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py")))
+def test_examples_say_how_they_are_run(name):
+    assert f"python examples/{name}" in (EXAMPLES / name).read_text()
