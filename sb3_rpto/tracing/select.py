@@ -25,7 +25,9 @@ FOLDS = 6
 #: t from which on a bundle of effects is not dropped at once.
 BUNDLE = 1.5
 #: Rounds of the look forward, and candidates fitted in each.
-ROUNDS, PROMISING = 4, 6
+ROUNDS, PROMISING = 4, 4
+#: Typical window error, in units of the noise, that leaves nothing to look forward to.
+ENOUGH = 1.1
 #: Candidates for a substitution are the likest so many.
 SUBSTITUTES = 5
 
@@ -296,16 +298,14 @@ class Selector:
     def add_back(self, selection: Selection, candidates: Sequence[int]) -> Selection:
         """The look forward: where much is missing, the joint fit may end far from the best; add what is clearly needed.
 
-        Each round fits the effects that promise most one by one and keeps the best, if it is clear.
+        Each round fits the effects outside one by one, first roughly, and keeps the best if it is clear.
         """
         for _ in range(ROUNDS):
             current = selection.model
-            outside = [c for c in candidates if c not in current.effects]
-            gains = self._promise(current, outside) if outside else {}
+            if np.median(current.errors) < ENOUGH:
+                break
             tried: list[tuple[float, Model, int]] = []
-            for e in sorted(outside, key=lambda e: -gains[e])[:PROMISING]:
-                if gains[e] < GAIN * current.fit.cost:
-                    break
+            for e in self._promising(current, [c for c in candidates if c not in current.effects]):
                 self.say(f"looking at {self.simulation.effects[e].label} again")
                 trial = self.model([*current.effects, e], current.fit, REFIT + 3)
                 evidence = self.evidence(trial, current)
@@ -317,26 +317,17 @@ class Selector:
             selection.dropped.pop(added, None)
         return selection
 
-    def _promise(self, model: Model, outside: Sequence[int]) -> dict[int, float]:
-        """How much each effect could lower the cost, to second order."""
-        free = self.free([*model.effects, *outside])
-        free = free[self.simulation.strength[free] | (model.fit.values[free] != self.simulation.null[free])]
+    def _promising(self, model: Model, outside: Sequence[int]) -> list[int]:
+        """The effects outside that lower the log errors most in a short fit to every third window."""
         some = np.arange(0, len(self.train.windows), 3)
-        linear = self.train.on(some).linear(replace(model.fit, starts=model.fit.starts[some]), free)
-        share = len(self.train.windows) / len(some)
-        normal, gradient = share * linear.normal.sum(0), share * linear.gradient.sum(0)
-        known = np.flatnonzero(
-            ~np.isin(free, np.concatenate([np.arange(*_ends(self.simulation.slices[e])) for e in outside]))
-        )
+        part, begin = self.train.on(some), model.fit.starts[some]
+        base = part.fit(model.fit.values, self.free(model.effects), begin, 3)
         gains = {}
         for e in outside:
-            rows = np.flatnonzero(np.isin(free, np.arange(*_ends(self.simulation.slices[e]))))
-            inner = normal[np.ix_(known, known)] + 1e-6 * np.eye(len(known))
-            cross = np.linalg.solve(inner, normal[np.ix_(known, rows)])
-            perp = normal[np.ix_(rows, rows)] - normal[np.ix_(rows, known)] @ cross
-            g = gradient[rows] - cross.T @ gradient[known]
-            gains[e] = float(g @ np.linalg.pinv(perp, rcond=1e-9) @ g)
-        return gains
+            fit = part.fit(base.values, self.free([*model.effects, e]), base.starts, 4, tolerance=1e-2)
+            gains[e] = float(np.mean(np.log(base.errors) - np.log(fit.errors)))
+        best = sorted(outside, key=lambda e: -gains[e])[:PROMISING]
+        return [e for e in best if gains[e] > GAIN]
 
 
 def folds(windows: Windows, count: int, horizon: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -357,10 +348,6 @@ def folds(windows: Windows, count: int, horizon: float) -> list[tuple[np.ndarray
         # Where the gap leaves nothing, the data are too short for one.
         parts.append((np.flatnonzero(others if others.any() else ~chosen), np.flatnonzero(chosen)))
     return parts
-
-
-def _ends(s: slice) -> tuple[int, int]:
-    return s.start, s.stop
 
 
 def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:

@@ -1,0 +1,126 @@
+"""Trace what the declared models of three real machines lack, and write tables and figures.
+
+python examples/real_machines.py --out runs/machines
+
+The recordings are not part of the project: docs/real-machines.md says where they come from. Each machine's parameters
+and effects are chosen on its training runs alone; the test runs and the other distribution are looked at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import platform
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+
+from sb3_rpto.experiments.machines import MACHINES, Machine, find_measured
+from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, predictions
+from sb3_rpto.tracing.windows import cut
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+RESULTS = Path("examples/results/machines")
+
+
+def rows(name: str, data: str, model: str, errors: list[HorizonError]) -> list[dict[str, object]]:
+    """One row for each horizon and joint, in rad."""
+    return [
+        {
+            "machine": name,
+            "data": data,
+            "model": model,
+            "horizon": e.horizon,
+            "joint": joint,
+            **{key: f"{getattr(e, key)[j]:.5f}" for key in ("rmse", "low", "high", "mae")},
+            "windows": e.windows,
+        }
+        for e in errors
+        for j, joint in enumerate(e.joints)
+    ]
+
+
+def study(machine: Machine, out: Path, seed: int) -> tuple[list[dict[str, object]], dict[str, object]]:
+    """Trace one machine: error rows and what was found."""
+    began = time.perf_counter()
+    report = trace(machine.xml, machine.data, machine.declared, seed=seed)
+    seconds = time.perf_counter() - began
+    report.save(out / machine.name)
+    print(f"\n===== {machine.name}, {seconds:.0f} s\n{report}")
+    found = rows(machine.name, "test", "declared", report.before) + rows(machine.name, "test", "corrected", report.after)
+    found += rows(machine.name, "test", "noise floor", report.floor)
+    if machine.other is not None:
+        for label, values in (("declared", report.values_before), ("corrected", report.values_after)):
+            errors = horizon_errors(report.simulation, values, machine.other, report.sigma, seed)
+            found += rows(machine.name, "other", label, errors)
+    draw(machine, report)
+    kept = {key: report.to_json()[key] for key in ("verdict", "declared", "effects", "adequacy_before", "adequacy_after")}
+    return found, {**kept, "seconds": round(seconds), "runs": report.runs, "horizon": report.horizon}
+
+
+def draw(machine: Machine, report: Report, horizon: float = 1.0) -> None:
+    """Measured and predicted positions of a typical test window, and of a typical other one."""
+    sets: list[tuple[str, Measurements]] = [("test run", report.data)]
+    if machine.other is not None:
+        sets.append(("other distribution", machine.other))
+    joints = [c for c in report.data.columns.qpos if c not in report.data.unobserved]
+    figure, axes = plt.subplots(
+        len(joints), len(sets), figsize=(5 * len(sets), 2.6 * len(joints)), squeeze=False, layout="constrained"
+    )
+    for column, (title, data) in enumerate(sets):
+        windows = cut(report.simulation.model, data, report.sigma, horizon, 60)
+        before, difference, _ = predictions(report.simulation, report.values_before, windows)
+        after, _, _ = predictions(report.simulation, report.values_after, windows)
+        errors = np.sqrt((difference**2).mean(axis=(1, 2)))
+        # The window whose error before is the median: neither the best nor the worst for show.
+        w = int(np.argsort(errors)[len(errors) // 2])
+        usable = windows.usable[w]
+        seconds = windows.at[w][usable] * report.simulation.model.opt.timestep
+        for row, joint in enumerate(joints):
+            ax = axes[row, column]
+            ax.plot(seconds, windows.measured[w][usable][:, row], color="black", label="measured")
+            ax.plot(seconds, before[w][usable][:, row], color="#d55e00", linestyle="--", label="declared model")
+            ax.plot(seconds, after[w][usable][:, row], color="#0072b2", label="corrected model")
+            ax.set(xlabel="time in the window [s]", ylabel=f"{joint} [rad]", title=title if row == 0 else "")
+    axes[0, 0].legend(fontsize=8)
+    Path("docs/images").mkdir(parents=True, exist_ok=True)
+    figure.savefig(f"docs/images/{machine.name}.png", dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("runs/machines"), help="folder of the reports")
+    parser.add_argument("--only", choices=sorted(MACHINES), action="append", help="some machines; default: all")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    folder = find_measured()
+    if folder is None:
+        parser.error("the recordings are not here; set RPTO_MEASURED to their folder (docs/real-machines.md)")
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    for name in arguments.only or MACHINES:
+        errors, found = study(MACHINES[name](folder), arguments.out, arguments.seed)
+        with (RESULTS / f"{name}.csv").open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.DictWriter(stream, list(errors[0]))
+            writer.writeheader()
+            writer.writerows(errors)
+        manifest = {
+            "command": f"python examples/real_machines.py --only {name} --seed {arguments.seed}",
+            "versions": {p: version(p) for p in ("sb3-rpto", "mujoco", "numpy", "scipy")},
+            "python": platform.python_version(),
+            "licence": MACHINES[name](folder).licence,
+            "source": MACHINES[name](folder).source,
+            **found,
+        }
+        (RESULTS / f"{name}.json").write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
