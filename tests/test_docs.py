@@ -9,6 +9,8 @@ from itertools import product
 from pathlib import Path
 
 import gymnasium as gym
+import mujoco
+import numpy as np
 import pytest
 from conftest import ALGORITHMS, SMALL_POLICY, pendulum, small
 from stable_baselines3.common.callbacks import EvalCallback
@@ -18,6 +20,8 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_rpto import RPTO
 from sb3_rpto.callbacks import RelativityGapCallback
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
+from sb3_rpto.effects import LIBRARY, declare, parameter_names
+from sb3_rpto.effects.carry import carried_by
 from sb3_rpto.presets import preset_names, resolve_preset
 
 ROOT = Path(__file__).parents[1]
@@ -42,8 +46,13 @@ def test_code_blocks_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(EnsembleDynamics.__init__.__kwdefaults__, "hidden", (16, 16))
     namespace = {"__name__": "__main__"}
-    for block in runnable(page):
-        exec(compile(re.sub(r"\b\d+(_\d{3})+\b", BUDGET, block), str(page), "exec"), namespace)
+    known = dict(LIBRARY)
+    try:
+        for block in runnable(page):
+            exec(compile(re.sub(r"\b\d+(_\d{3})+\b", BUDGET, block), str(page), "exec"), namespace)
+    finally:
+        LIBRARY.clear()
+        LIBRARY.update(known)
 
 
 @by_page
@@ -121,3 +130,59 @@ def test_the_preset_table_is_the_files():
         values |= values.pop("dynamics_kwargs", {})
         for name, cell in zip(header[2:], cells):
             assert cell.replace(",", "") == str(values.get(name, "")), (preset, backend, name)
+
+
+def table_after(page: str, header: str) -> list[str]:
+    """The rows of the table with this header."""
+    lines = (ROOT / "docs" / page).read_text().splitlines()
+    start = lines.index(header) + 2
+    return lines[start : next(i for i in range(start, len(lines)) if not lines[i].startswith("|"))]
+
+
+EFFECTS = "| kind | place | parameters (null) | equation | held by | left out where declared | what excites it |"
+
+
+def effect_rows() -> list[str]:
+    """The rows of the table of effects, by place and then as the library lists them."""
+    rows = []
+    for place in ("joint", "actuator", "sensor", "body", "geom", "world"):
+        for kind in (k for k in LIBRARY.values() if k.place == place):
+            parameters = "; ".join(
+                " ".join(f"`{p.name}` {p.unit} ({'from ' if p.shape else ''}{p.null:g})".split())
+                for p in kind.parameters
+            )
+            native = f"`{kind.native}`" if carried_by(kind("anywhere")) == "mjcf" else "wrapper"
+            same = ", ".join(f"`{name}`" for name in kind.same)
+            cells = [f"`{kind.kind}`", place, parameters, f"`{kind.equation}`", native, same, kind.excite]
+            row = "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+            rows.append(row.replace("|  |", "| |"))
+    return rows
+
+
+def test_the_table_of_effects_is_the_library():
+    assert table_after("effects.md", EFFECTS) == effect_rows()
+    assert all(kind.native or carried_by(kind("anywhere")) == "wrapper" for kind in LIBRARY.values())
+
+
+DECLARED = "| object | parameter | unit | bounds |"
+ONE_OF_EACH = """<mujoco><option density="1" viscosity="1"/><worldbody><body name="body">
+<joint name="joint" damping="1" frictionloss="1" armature="1" stiffness="1"/>
+<geom name="geom" type="capsule" fromto="0 0 0 1 0 0" size=".1"/></body></worldbody>
+<actuator><position name="actuator" joint="joint" kp="1"/></actuator></mujoco>"""
+
+
+def declared_rows() -> list[str]:
+    """The rows of the table of parameters that can be declared."""
+    model = mujoco.MjModel.from_xml_string(ONE_OF_EACH)
+    rows = []
+    for name in parameter_names(model):
+        owner, _, parameter = name.rpartition(".")
+        (known,) = declare(model, [name])
+        (p,) = known.parameters
+        bounds = f"{p.lower:g} or more" if np.isinf(p.upper) else f"{p.lower / p.null:g} to {p.upper / p.null:g} times"
+        rows.append(f"| {owner} | `{parameter}` | {p.unit} | {bounds} |".replace("|  |", "| |"))
+    return rows
+
+
+def test_the_table_of_declared_parameters_is_what_can_be_declared():
+    assert table_after("effects.md", DECLARED) == declared_rows()
