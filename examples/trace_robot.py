@@ -106,6 +106,8 @@ def compare(report: Report, envelope: Envelope) -> None:
             print(f"  {p.name}: found {value:.4g} [{low:.4g}, {high:.4g}] {p.unit}, true {true:.4g}")
     else:
         print(f"  named {like[0]}, which these data cannot tell from it" if like else "  MISSED")
+        if like:
+            print("  (declared values belong to the effect that is named: they may be far off here)")
     others = [name for name in named if name != label and name not in like[:1]]
     if effect is not None and others:
         print(f"  named beside it, wrongly: {', '.join(others)}")
