@@ -20,7 +20,7 @@ TRUST = 3.0
 #: Weak pull of an effect's parameters towards their null values, in plausible sizes.
 RIDGE = 30.0
 #: Finite differences, in plausible sizes: at a null value they are as wide as the effect must be to show.
-WIDE, NARROW = 1.0, 0.05
+WIDE, NARROW = 1.0, 0.01
 #: Most simulations in one batch.
 CHUNK = 6000
 

@@ -318,14 +318,14 @@ class Selector:
         return selection
 
     def _promising(self, model: Model, outside: Sequence[int]) -> list[int]:
-        """The effects outside that lower the log errors most in a short fit to every third window."""
+        """The effects outside that lower the log errors or the cost most in a short fit to every third window."""
         some = np.arange(0, len(self.train.windows), 3)
         part, begin = self.train.on(some), model.fit.starts[some]
         base = part.fit(model.fit.values, self.free(model.effects), begin, 3)
         gains = {}
         for e in outside:
-            fit = part.fit(base.values, self.free([*model.effects, e]), base.starts, 4, tolerance=1e-2)
-            gains[e] = float(np.mean(np.log(base.errors) - np.log(fit.errors)))
+            fit = part.fit(base.values, self.free([*model.effects, e]), base.starts, 6)
+            gains[e] = max(float(np.mean(np.log(base.errors) - np.log(fit.errors))), 1 - fit.cost / base.cost)
         best = sorted(outside, key=lambda e: -gains[e])[:PROMISING]
         return [e for e in best if gains[e] > GAIN]
 
@@ -351,6 +351,7 @@ def folds(windows: Windows, count: int, horizon: float) -> list[tuple[np.ndarray
 
 
 def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:
-    """What to try to drop: all that hardly matter at once, a half or a quarter of them, the cheapest three each."""
+    """What to try to drop: those that hardly matter, at most half of all at once, fewer, the cheapest three each."""
+    trifles = trifles[: (len(order) + 1) // 2]
     bundles = [trifles, trifles[: len(trifles) // 2], trifles[: len(trifles) // 4]] if len(trifles) > 1 else []
     return [b for b in bundles if len(b) > 1] + [[e] for e in order[:3]]

@@ -73,7 +73,7 @@ def trace(
     :return: the verdict, the effects, errors before and after, and the corrected model
     :raises ValueError: data and model do not fit together, or the data are too few
     """
-    say = progress or (lambda share, what: None)
+    say = _steady(progress)
     source, compiled = load_model(model)
     findings = [*data.findings, *check_against(compiled, data)]
     train, select, test = data.split(seed)
@@ -118,10 +118,26 @@ def trace(
 
     say(0.85, "fitting the final model")
     joined = windows[0] if windows[1] is None else join(windows[0], windows[1])
-    final, intervals = refit(selection, Problem(simulation, joined, scales), seed)
+    problem = Problem(simulation, joined, scales)
+    final, intervals = refit(selection, problem, seed)
+    # Both models are fitted to the same data before they are compared on the test runs.
+    before = problem.fit(before.values, selector.free(()), iterations=10)
     verdict = judge(first, last, bool(selection.model.effects))
     say(0.9, "predicting the test runs")
     return _report(locals())
+
+
+def _steady(progress: Progress | None) -> Progress:
+    """Progress that never goes back: steps that come again keep the share that was reached."""
+    reached = 0.0
+
+    def say(share: float, what: str) -> None:
+        nonlocal reached
+        reached = max(reached, share)
+        if progress is not None:
+            progress(reached, what)
+
+    return say
 
 
 def fit_declared(selector: Selector, seed: int) -> Fit:
@@ -265,9 +281,13 @@ def _horizon(data: Measurements) -> float:
 def _windows(
     model: mujoco.MjModel, train: Measurements, select: Measurements, sigma: np.ndarray, horizon: float
 ) -> tuple[Windows, Windows | None]:
-    """Windows to fit and to select on; None to select on where no runs are set apart: then blocks take turns."""
+    """Windows to fit and to select on; None to select on where too little is set apart: then blocks take turns."""
     if select.episodes:
-        return cut(model, train, sigma, horizon, TRAIN), cut(model, select, sigma, horizon, SELECT)
+        judging = cut(model, select, sigma, horizon, SELECT)
+        # A single block is no evidence for anything.
+        if len(np.unique(judging.block)) > 1:
+            return cut(model, train, sigma, horizon, TRAIN), judging
+        train = replace(train, episodes=train.episodes + select.episodes)
     every = cut(model, train, sigma, horizon, TRAIN + SELECT)
     if len(every) < FEW:
         every = cut(model, train, sigma, horizon, 2 * FEW, overlap=OVERLAP)
