@@ -23,13 +23,10 @@ from sb3_rpto.tracing.report import Candidate, Report, Traced
 from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary, typical
 from sb3_rpto.tracing.screen import Screening, screen
 from sb3_rpto.tracing.select import Model, Selection, Selector
-from sb3_rpto.tracing.windows import Windows, cut, noise_levels, time_step
+from sb3_rpto.tracing.windows import Windows, cut, discretised, noise_levels
 
 #: Most windows to fit, and to select on.
 TRAIN, SELECT = 40, 40
-#: Longest integration steps in s for measured data: at a reversal dry friction errs by up to a step, and half a radian
-#: a second per millisecond is easily seen. Eliminating effects is content with the coarse one.
-FINE, COARSE = 0.001, 0.002
 #: Few windows overlap by this share.
 OVERLAP = 2 / 3
 #: Seconds of training data that count as short.
@@ -81,8 +78,7 @@ def trace(
     fitted = replace(data, episodes=train.episodes + select.episodes)
     sigma = noise_levels(fitted)
     horizon = horizon or _horizon(fitted)
-    nominal = compiled.__copy__()
-    nominal.opt.timestep = time_step(nominal, data, FINE)
+    nominal = discretised(compiled, data, fine=True)
     known = declare(nominal, declared)
     effects: list[Effect] = [*known, *_candidates(nominal, [d.label for d in known], candidates)]
     simulation = Simulation(nominal, effects, threads)
@@ -104,8 +100,7 @@ def trace(
     if not first.adequate:
         say(0.15, "screening the candidates")
         screening = screen(selector.train, before)
-        coarse = compiled.__copy__()
-        coarse.opt.timestep = time_step(coarse, data, COARSE)
+        coarse = discretised(compiled, data, fine=False)
         rough = Selector.on(
             Simulation(coarse, effects, threads), _windows(coarse, train, select, sigma, horizon), scales, horizon, say
         )
@@ -173,8 +168,8 @@ def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
 def search(selector: Selector, rough: Selector, base: Model, screening: Screening, say: Progress) -> Selection:
     """Joint fit of all excited candidates, elimination backwards, a last look forward, substitution by like ones.
 
-    :param selector: fine steps, for what is decided in the end
-    :param rough: coarse steps, for the elimination: it costs most
+    :param selector: integrates finely, for what is decided in the end
+    :param rough: integrates as the model does, for the elimination: it costs most
     :param base: the declared parameters alone
     """
     chosen = worth_fitting(selector, screening)

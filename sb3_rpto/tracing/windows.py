@@ -22,6 +22,8 @@ MEMORY = 0.25
 EXACT = 1e-4
 #: Least length of a block of windows in s; blocks count as independent.
 BLOCK = 1.0
+#: Longest integration step in s for measured data.
+LONGEST = 0.002
 #: Half the time, in s, over which the state at a window's start is smoothed, and the fewest samples on each side.
 HALF_WIDTH, HALF_COUNT = 0.025, 4
 
@@ -106,11 +108,23 @@ def _difference_noise(episodes: Sequence[Episode], column: int, order: int) -> f
     return float(np.sqrt(squares[: max(1, round(0.95 * len(squares)))].mean() / 0.7588))
 
 
-def smoothed_state(episode: Episode, index: int, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def half_step(model: mujoco.MjModel) -> float:
+    """By how much, in s, velocities and commands lead positions in the model's integrator.
+
+    Semi-implicit integrators move positions by the new velocity: as in the leapfrog scheme a velocity belongs half a
+    step before its position, and a command acts from half a step before its instant. Seen so they are of second order.
+    """
+    return 0.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5 * float(model.opt.timestep)
+
+
+def smoothed_state(
+    episode: Episode, index: int, sigma: np.ndarray, lead: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position and velocity of the scalar columns at a sample by a local cubic in time, and their spread.
 
     :param index: of the sample
     :param sigma: noise of the position columns, (m,)
+    :param lead: velocities are those of so many s before the sample
     :return: positions (m,), velocities (m,), standard deviations of both (2, m)
     """
     step = float(np.median(np.diff(episode.time)))
@@ -122,16 +136,24 @@ def smoothed_state(episode: Episode, index: int, sigma: np.ndarray) -> tuple[np.
     inverse = np.linalg.pinv(basis)
     coefficients = inverse @ episode.qpos[first:last]
     spread = np.sqrt(np.sum(inverse[:2] ** 2, axis=1))[:, None] * sigma
-    return coefficients[0], coefficients[1] / scale, spread / np.array([[1.0], [scale]])
+    z = -lead / scale
+    velocity = (coefficients[1] + 2 * z * coefficients[2] + 3 * z**2 * coefficients[3]) / scale
+    return coefficients[0], velocity, spread / np.array([[1.0], [scale]])
 
 
-def time_step(model: mujoco.MjModel, data: Measurements, longest: float) -> float:
-    """Integration step for the data in s: the model's own for exact data, else a whole fraction of it.
+def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco.MjModel:
+    """A copy of the model that integrates as the data ask for.
 
-    :param longest: that it may have
+    A simulator's data are met by its own integrator and time step. The world knows no steps: measured data take steps
+    of at most 2 ms, with the Runge-Kutta method of fourth order where it is to be ``fine``. A semi-implicit step of
+    1 ms errs by more than a milliradian in half a second.
     """
-    h = float(model.opt.timestep)
-    return h if data.exact else h / math.ceil(h / longest - 1e-9)
+    copy = model.__copy__()
+    if not data.exact:
+        copy.opt.timestep = model.opt.timestep / math.ceil(model.opt.timestep / LONGEST - 1e-9)
+        if fine:
+            copy.opt.integrator = int(mujoco.mjtIntegrator.mjINT_RK4)
+    return copy
 
 
 def cut(
@@ -201,7 +223,9 @@ def _build(
         qpos[w], qvel[w], spread[w] = start_state(model, data, e, begin, sigma, addresses)
         grid = t0 + h * np.arange(-before, steps)
         row = np.clip(np.searchsorted(e.time, grid + 1e-6 * h, side="right") - 1, 0, len(e) - 1)
-        commands[w][:, actuators] = e.ctrl[row]
+        commands[w][:, actuators] = (
+            e.ctrl[row] if data.exact else held(e.time, e.ctrl, np.append(grid, grid[-1] + h) - half_step(model))
+        )
         enabled[w][:, actuators] = e.enabled[row[before:]]
         n = end - begin - 1
         at[w, :n] = np.minimum((e.time[begin + 1 : end] - t0) / h, steps)
@@ -233,6 +257,22 @@ def _build(
     )
 
 
+def held(time: np.ndarray, ctrl: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Mean over each step of commands that hold until the next sample: its impulse, wherever in the step they change.
+
+    :param time: of the samples in s, (T,)
+    :param ctrl: from each sample on, (T, nu); the first held before, the last after
+    :param edges: of the steps in s, (K + 1,)
+    :return: (K, nu)
+    """
+    ends = min(time[0], edges[0]) - 1.0, max(time[-1], edges[-1]) + 1.0
+    knots = np.concatenate([[ends[0]], time, [ends[1]]])
+    levels = np.concatenate([ctrl[:1], ctrl])
+    impulse = np.concatenate([np.zeros((1, ctrl.shape[1])), np.cumsum(levels * np.diff(knots)[:, None], axis=0)])
+    reached = np.stack([np.interp(edges, knots, column) for column in impulse.T], axis=1).reshape(len(edges), -1)
+    return np.diff(reached, axis=0) / np.diff(edges)[:, None]
+
+
 def start_state(
     model: mujoco.MjModel, data: Measurements, episode: Episode, index: int, sigma: np.ndarray, addresses: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -243,7 +283,7 @@ def start_state(
         qpos[addresses] = episode.qpos[index]
         qvel[dofs] = episode.qvel[index]
         return qpos, qvel, spread
-    position, velocity, deviation = smoothed_state(episode, index, sigma)
+    position, velocity, deviation = smoothed_state(episode, index, sigma, half_step(model))
     qpos[addresses] = position
     scalar = {int(model.jnt_qposadr[j]): int(model.jnt_dofadr[j]) for j in scalar_joints(model)}
     if len(scalar) < model.njnt:

@@ -28,13 +28,13 @@ def compiled(xml: str = PENDULUM) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(xml)
 
 
-def torques(episodes: int, samples: int, seed: int, size: float = 1.5) -> np.ndarray:
+def torques(episodes: int, samples: int, seed: int, size: float = 1.5, rate: int = RATE) -> np.ndarray:
     """A slow swing with steps in it, (episodes, samples)."""
     rng = np.random.default_rng([seed, 1])
-    t = np.arange(samples) / RATE
-    phase, rate = rng.uniform(0, 2 * np.pi, (2, episodes, 1)), rng.uniform(0.4, 1.0, (episodes, 1))
-    steps = np.repeat(rng.uniform(-1, 1, (episodes, samples // 40 + 1)), 40, axis=1)[:, :samples]
-    return size * (0.5 * np.sin(2 * np.pi * rate * t + phase[0]) + 0.5 * steps)
+    t, hold = np.arange(samples) / rate, rate // 5
+    phase, turns = rng.uniform(0, 2 * np.pi, (2, episodes, 1)), rng.uniform(0.4, 1.0, (episodes, 1))
+    steps = np.repeat(rng.uniform(-1, 1, (episodes, samples // hold + 1)), hold, axis=1)[:, :samples]
+    return size * (0.5 * np.sin(2 * np.pi * turns * t + phase[0]) + 0.5 * steps)
 
 
 def table(time: np.ndarray, q: np.ndarray, v: np.ndarray, u: np.ndarray, model: mujoco.MjModel) -> dict:
@@ -59,16 +59,18 @@ def recorded(
     commands: np.ndarray | None = None,
     exact: bool = False,
     start: Sequence[float] | None = None,
+    rate: int = RATE,
 ) -> Measurements:
-    """Runs of the model with the effects in it, sampled at :data:`RATE` with white noise on the positions.
+    """Runs of the model with the effects in it, sampled with white noise on the positions.
 
     :param commands: (episodes, samples)
     :param start: sizes of the first positions and of the first velocities
+    :param rate: of the samples in Hz
     """
     model = model or compiled()
-    every, samples = round(1 / RATE / model.opt.timestep), round(duration * RATE)
+    every, samples = round(1 / rate / model.opt.timestep), round(duration * rate)
     rng = np.random.default_rng([seed, 0])
-    u = torques(episodes, samples, seed) if commands is None else commands
+    u = torques(episodes, samples, seed, rate=rate) if commands is None else commands
     simulation = Simulation(model, [*effects], 1)
     sizes = np.array([0.5, 1.0] if start is None else start)[:, None, None]
     qpos, qvel = sizes * rng.uniform(-1, 1, (2, episodes, model.nq))
@@ -78,7 +80,7 @@ def recorded(
     q, v = simulation.rollout(np.tile(simulation.values(), (episodes, 1)), qpos, qvel, drive)
     q, v = q[:, ::every], v[:, ::every]
     q = q + noise * rng.standard_normal(q.shape)
-    data = Measurements.from_tables({"runs": table(np.arange(samples) / RATE, q, v, u[..., None], model)})
+    data = Measurements.from_tables({"runs": table(np.arange(samples) / rate, q, v, u[..., None], model)})
     return replace(data, exact=exact)
 
 

@@ -1,6 +1,5 @@
 """Tracing as a whole, through the public API."""
 
-import importlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -21,8 +20,8 @@ from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Measurements, Report, trace
 
 KINDS = ["coulomb_friction", "torque_offset"]
-#: steps as long as the samples are apart, in the recording as in the trace
-COARSE = PENDULUM.replace('timestep="0.001"', 'timestep="0.005"')
+#: steps as long as the samples are apart, in the recording as in the trace, and of an order that such steps need
+COARSE = PENDULUM.replace('timestep="0.001"', 'timestep="0.01" integrator="RK4"')
 #: without forces in every substep, which take longest
 NATIVE = ["coulomb_friction", "spring"]
 #: what may change when only the test runs do
@@ -44,7 +43,7 @@ def complete(seed: int) -> Report:
 
 
 def few(runs: int, duration: float = 2.1) -> Measurements:
-    return recorded([CoulombFriction("hinge", level=0.08)], compiled(COARSE), episodes=runs, duration=duration)
+    return recorded([CoulombFriction("hinge", level=0.08)], compiled(COARSE), runs, duration, rate=100)
 
 
 @cache
@@ -62,7 +61,7 @@ def traced_simply(
     progress: Callable[[float, str], None] | None = None,
 ) -> Report:
     data = data or simple()
-    with mock.patch.multiple(importlib.import_module("sb3_rpto.tracing.trace"), FINE=0.005, COARSE=0.005):
+    with mock.patch("sb3_rpto.tracing.windows.LONGEST", 0.01):
         return trace(model, data, declared, candidates=kinds, horizon=horizon, threads=1, progress=progress)
 
 
@@ -213,14 +212,14 @@ def test_progress_goes_forward() -> None:
 
 
 def test_nothing_declared_and_no_candidates_is_a_check_of_the_model() -> None:
-    report = traced_simply(recorded(model=compiled(COARSE)), [], declared=())
+    report = traced_simply(recorded(model=compiled(COARSE), rate=100), [], declared=())
     assert report.verdict == "complete"
     assert traced_simply(few(4), [], declared=()).verdict == "unexplained"
 
 
 def test_a_declared_parameter_that_the_data_cannot_show_stops_nothing() -> None:
-    still = np.zeros((5, 420))
-    data = recorded([TorqueOffset("hinge", offset=0.2)], compiled(COARSE), episodes=5, commands=still)
+    still = np.zeros((5, 210))
+    data = recorded([TorqueOffset("hinge", offset=0.2)], compiled(COARSE), 5, commands=still, rate=100)
     report = traced_simply(data, ["torque_offset"], declared=["motor.gear"])
     assert [t.label for t in report.effects] == ["torque_offset(hinge)"]
 
