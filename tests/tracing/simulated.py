@@ -12,8 +12,9 @@ from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.windows import cut
 
-STEP, RATE = 0.001, 200
-PENDULUM = """<mujoco><option timestep="0.001"/><worldbody><body name="pole">
+RATE = 200
+#: an integrator whose steps may be as long as the samples are apart, and which has its instants where the samples are
+PENDULUM = """<mujoco><option timestep="0.005" integrator="RK4"/><worldbody><body name="pole">
 <joint name="hinge" axis="0 -1 0" damping="0.05"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="0.5"/>
 </body></worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
 #: with a wheel beside it that nothing drives

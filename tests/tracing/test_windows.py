@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from simulated import PENDULUM, compiled, recorded
 
+from sb3_rpto.effects import Simulation
 from sb3_rpto.effects.names import object_id
 from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.episodes import Episode
-from sb3_rpto.tracing.windows import EXACT, cut, noise_levels, smoothed_state, time_step
+from sb3_rpto.tracing.identify import interpolate
+from sb3_rpto.tracing.windows import EXACT, cut, discretised, noise_levels, smoothed_state
 
 SIGMA = np.array([1e-3])
 
@@ -123,13 +125,43 @@ def test_spread_of_the_smoothed_state_is_that_of_repeated_noise(index: int) -> N
 # --- cutting ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_step_divides_the_models_and_is_at_most_as_long_as_it_may_be() -> None:
+def test_the_world_is_integrated_finely_and_a_simulator_as_it_integrates_itself() -> None:
     model, data = compiled(), swings()
-    for step, expected in ((0.002, 0.001), (0.0015, 0.00075), (0.001, 0.001), (0.0005, 0.0005), (0.01, 0.001)):
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for step, expected in ((0.002, 0.002), (0.003, 0.0015), (0.001, 0.001), (0.0005, 0.0005), (0.01, 0.002)):
         model.opt.timestep = step
-        assert time_step(model, data, 0.001) == pytest.approx(expected, rel=1e-12)
-        assert time_step(model, data, 0.002) <= 0.002
-        assert time_step(model, replace(data, exact=True), 0.001) == step
+        for fine, integrator in (
+            (True, mujoco.mjtIntegrator.mjINT_RK4),
+            (False, mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
+        ):
+            found = discretised(model, data, fine)
+            assert found.opt.timestep == pytest.approx(expected, rel=1e-12)
+            assert found.opt.integrator == integrator
+            same = discretised(model, replace(data, exact=True), fine)
+            assert (same.opt.timestep, same.opt.integrator) == (step, model.opt.integrator)
+    assert model.opt.timestep == 0.01
+
+
+def predicted(data: Measurements, integrator: str) -> np.ndarray:
+    """Positions of all windows at their samples by steps of 2 ms."""
+    setting = f'timestep="0.002" integrator="{integrator}"'
+    model = compiled(PENDULUM.replace('timestep="0.005" integrator="RK4"', setting))
+    w = cut(model, data, SIGMA, 0.4, 100)
+    q, v = Simulation(model, [], 1).rollout(np.empty((len(w), 0)), w.qpos, w.qvel, w.drive)
+    return interpolate(q, v, w.at, 0.002, np.array([0]), np.array([0]))
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_semi_implicit_steps_are_of_second_order_from_where_they_have_their_velocities(
+    integrator: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = recorded(noise=0.0, duration=3.1)
+    exact, found = predicted(data, "RK4"), predicted(data, integrator)
+    monkeypatch.setattr("sb3_rpto.tracing.windows.half_step", lambda model: 0.0)
+    first_order = np.abs(predicted(data, integrator) - exact)
+    np.testing.assert_array_equal(predicted(data, "RK4"), exact)
+    assert np.median(first_order) > 1e-3
+    assert np.median(np.abs(found - exact)) < 0.15 * np.median(first_order)
 
 
 def test_windows_lie_side_by_side_in_each_episode() -> None:
@@ -176,18 +208,32 @@ def test_no_window_begins_at_a_sample_whose_state_is_unknown_and_such_samples_do
     assert count > 0
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
 @pytest.mark.parametrize("jitter", [0.0, 0.7])
-def test_commands_are_those_held_at_each_step_from_before_the_start(jitter: float) -> None:
+def test_commands_are_the_mean_of_those_held_over_each_step_from_before_the_start(
+    jitter: float, integrator: str
+) -> None:
     t = clock(500, 200.0, jitter)
-    model, data = compiled(), ramps([t])
+    model, data = compiled(PENDULUM.replace("RK4", integrator)), ramps([t])
     windows = cut(model, data, SIGMA, 0.3, 100)
     h = model.opt.timestep
     assert windows.drive.commands.shape[1] - windows.drive.before == round(0.3 / h)
-    for w in range(len(windows)):
+    parts = (np.arange(4000) + 0.5) / 4000
+    for w in range(0, len(windows), 3):
         t0 = t[np.argmin(np.abs(t - windows.qpos[w, 0]))]
-        grid = t0 + h * np.arange(-windows.drive.before, round(0.3 / h))
-        held = [t[t <= g + 1e-9][-1] if g >= t[0] - 1e-9 else t[0] for g in grid]
-        np.testing.assert_allclose(windows.drive.commands[w, :, 0], held, atol=1e-12)
+        begin = t0 + h * np.arange(-windows.drive.before, round(0.3 / h)) - (0.0 if integrator == "RK4" else h / 2)
+        within = begin[:, None] + h * parts
+        row = np.clip(np.searchsorted(t, within, side="right") - 1, 0, len(t) - 1)
+        np.testing.assert_allclose(windows.drive.commands[w, :, 0], t[row].mean(1), atol=2e-6)
+
+
+def test_commands_of_exact_data_are_those_of_the_samples() -> None:
+    data = recorded(noise=0.0, exact=True)
+    w = cut(compiled(), data, SIGMA, 0.4, 100)
+    e = data.episodes[0]
+    np.testing.assert_array_equal(
+        w.drive.commands[0, w.drive.before :, 0], e.ctrl[: w.drive.commands.shape[1] - w.drive.before, 0]
+    )
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.7])
@@ -291,8 +337,8 @@ def test_columns_in_another_order_than_the_models_reach_their_places() -> None:
     np.testing.assert_array_equal(windows.sigma, [1e-3, 2e-3])
     np.testing.assert_allclose(windows.spread[:, 0], 2 * windows.spread[:, 1])
     b = object_id(model, "actuator", "B")
-    assert np.all(windows.drive.commands[:, :, b] == 3)
-    assert np.all(windows.drive.commands[:, :, 1 - b] == 4)
+    np.testing.assert_allclose(windows.drive.commands[:, :, b], 3, rtol=1e-12)
+    np.testing.assert_allclose(windows.drive.commands[:, :, 1 - b], 4, rtol=1e-12)
 
 
 def test_positions_that_were_not_measured_are_not_compared() -> None:
