@@ -19,7 +19,6 @@ from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Measurements, Report, trace
 
-KINDS = ["coulomb_friction", "torque_offset"]
 #: the longest steps that the recording and the trace may have
 COARSE = PENDULUM.replace('timestep="0.005"', 'timestep="0.01"')
 #: without forces in every substep, which take longest
@@ -33,8 +32,11 @@ def planted(*effects: tuple[str, str], seed: int = 1) -> Planted:
     return generate("pendulum", list(effects), seed=seed, episodes=6, duration=2.5)
 
 
-def traced(p: Planted, data: Measurements | None = None, kinds: Sequence[str] = KINDS, seed: int = 0) -> Report:
-    return trace(p.xml, data or p.measurements, p.declared, seed=seed, candidates=kinds, threads=1)
+def traced(p: Planted, data: Measurements | None = None, kinds: Sequence[str] = NATIVE, seed: int = 0) -> Report:
+    assert 'timestep="0.002"' in p.xml
+    xml = p.xml.replace('timestep="0.002"', 'timestep="0.005"')  # as far apart as the samples
+    with mock.patch("sb3_rpto.tracing.windows.LONGEST", 0.005):
+        return trace(xml, data or p.measurements, p.declared, seed=seed, candidates=kinds, threads=1)
 
 
 @cache
@@ -259,7 +261,7 @@ def test_an_unknown_kind_of_candidate_is_refused_with_the_known_ones() -> None:
 def test_too_long_a_horizon_is_refused() -> None:
     p = planted()
     with pytest.raises(ValueError, match="lower horizon"):
-        trace(p.xml, p.measurements, p.declared, candidates=KINDS, horizon=30.0, threads=1)
+        trace(p.xml, p.measurements, p.declared, candidates=NATIVE, horizon=30.0, threads=1)
 
 
 def test_too_few_samples_are_refused_in_words() -> None:
@@ -267,7 +269,7 @@ def test_too_few_samples_are_refused_in_words() -> None:
     table = {"time": t, "qpos.hinge": np.sin(t), "ctrl.motor": 0 * t}
     data = Measurements.from_tables({"a": table, "b": {**table, "qpos.hinge": np.cos(t)}})
     with pytest.raises(ValueError, match=r"few|short|longer|longest"):
-        trace(planted().xml, data, candidates=KINDS, threads=1)
+        trace(planted().xml, data, candidates=NATIVE, threads=1)
 
 
 # --- a gymnasium environment ------------------------------------------------------------------------------------------
@@ -292,7 +294,7 @@ def driven(friction: float) -> tuple[gym.Env, Measurements]:
 
 def test_an_unchanged_environment_is_complete_without_error() -> None:
     env, data = driven(0.0)
-    report = trace(env, data, candidates=KINDS, threads=1)
+    report = trace(env, data, candidates=NATIVE, threads=1)
     assert data.exact
     assert report.verdict == "complete"
     assert all(np.all(e.rmse < 1e-4) for e in report.before)
@@ -301,7 +303,7 @@ def test_an_unchanged_environment_is_complete_without_error() -> None:
 
 def test_dry_friction_that_an_environment_lacks_is_found() -> None:
     env, data = driven(1.0)
-    report = trace(env, data, candidates=KINDS, threads=1)
+    report = trace(env, data, candidates=NATIVE, threads=1)
     assert report.verdict in ("explained", "partly explained")
     labels = {t.label: t for t in report.effects}
     assert "coulomb_friction(slider)" in labels
