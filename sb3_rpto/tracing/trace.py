@@ -88,10 +88,14 @@ def trace(
         message = f"selected on {len(windows[0])} windows of the training runs by cross-validation over blocks"
         findings.append(Finding("split", "training runs", message))
     selector = Selector.on(simulation, windows, scales, horizon, say)
+    coarse = discretised(compiled, data, fine=False)
+    rough = Selector.on(
+        Simulation(coarse, effects, threads), _windows(coarse, train, select, sigma, horizon), scales, horizon, say
+    )
     judging = selector.judging
 
     say(0.05, "fitting the declared parameters")
-    base = selector.model((), fit_declared(selector, seed))
+    base = selector.model((), fit_declared(rough, seed), iterations=10)
     before = base.fit
     first = adequacy(judging, judging.score(before.values), seed)
     screening: Screening | None = None
@@ -100,10 +104,6 @@ def trace(
     if not first.adequate:
         say(0.15, "screening the candidates")
         screening = screen(selector.train, before)
-        coarse = discretised(compiled, data, fine=False)
-        rough = Selector.on(
-            Simulation(coarse, effects, threads), _windows(coarse, train, select, sigma, horizon), scales, horizon, say
-        )
         if calibrate:
             say(0.2, f"calibrating on {calibrate} complete sets")
             t = calibrated(rough, rough.model((), base.fit).fit, worth_fitting(selector, screening), calibrate, seed)
