@@ -290,6 +290,7 @@ class Selector:
                 selection.evidence[e] = self.evidence(current, without)
             weak = [e for e, evidence in selection.evidence.items() if not evidence.clear(self.threshold)]
             if not weak:
+                selection.alike = {e: found for e, found in selection.alike.items() if e in current.effects}
                 return selection
             worst = min(weak, key=lambda e: selection.evidence[e].t)
             selection.dropped[worst] = (0, selection.evidence[worst])

@@ -177,8 +177,9 @@ def search(selector: Selector, rough: Selector, base: Model, screening: Screenin
     selection = rough.eliminate(rough.together(chosen, rough.model((), base.fit).fit))
     selection = rough.add_back(selection, chosen)
     say(0.7, "trying like effects in their place")
+    selection = rough.substitute(selection, screening)
     selection.model = selector.model(selection.model.effects, selection.model.fit, iterations=10)
-    return selector.judge(selector.substitute(selection, screening))
+    return selector.judge(selection)
 
 
 def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 200) -> tuple[np.ndarray, np.ndarray]:
