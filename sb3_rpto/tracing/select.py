@@ -12,7 +12,8 @@ from sb3_rpto.tracing.identify import Fit, Problem, bounded_step
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.windows import Windows
 
-#: t*, between the 3 and 4 that complete data usually give as the 95 % quantile of the largest t; `calibrate` measures it.
+#: t*, between the 3 and 4 that complete data usually give as the 95 % quantile of the largest t; `calibrate` measures
+#: it for the data at hand.
 THRESHOLD = 3.5
 #: Effects must lower the typical window error by this share to stay.
 GAIN = 0.03
