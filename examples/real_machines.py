@@ -54,14 +54,15 @@ def study(machine: Machine, out: Path, seed: int) -> tuple[list[dict[str, object
     seconds = time.perf_counter() - began
     report.save(out / machine.name)
     print(f"\n===== {machine.name}, {seconds:.0f} s\n{report}")
-    found = rows(machine.name, "test", "declared", report.before) + rows(machine.name, "test", "corrected", report.after)
-    found += rows(machine.name, "test", "noise floor", report.floor)
+    models = (("declared", report.before), ("corrected", report.after), ("noise floor", report.floor))
+    found = [row for model, errors in models for row in rows(machine.name, "test", model, errors)]
     if machine.other is not None:
         for label, values in (("declared", report.values_before), ("corrected", report.values_after)):
             errors = horizon_errors(report.simulation, values, machine.other, report.sigma, seed)
             found += rows(machine.name, "other", label, errors)
     draw(machine, report)
-    kept = {key: report.to_json()[key] for key in ("verdict", "declared", "effects", "adequacy_before", "adequacy_after")}
+    keys = ("verdict", "declared", "effects", "adequacy_before", "adequacy_after")
+    kept = {key: report.to_json()[key] for key in keys}
     return found, {**kept, "seconds": round(seconds), "runs": report.runs, "horizon": report.horizon}
 
 
