@@ -1,0 +1,34 @@
+"""The threshold of selection, measured on sets in which nothing is missing."""
+
+import numpy as np
+from simulated import problem, recorded
+
+from sb3_rpto.effects.forces import TorqueOffset
+from sb3_rpto.effects.friction import CoulombFriction
+from sb3_rpto.tracing.calibrate import calibrated, largest_t
+from sb3_rpto.tracing.select import Selector
+
+
+def selector(level: float) -> Selector:
+    planted = [CoulombFriction("hinge", level=level)] if level else []
+    effects = [CoulombFriction("hinge"), TorqueOffset("hinge")]
+    train, select = (problem(effects, recorded(planted, seed=seed)) for seed in (0, 100))
+    return Selector(train, select, 3.5, lambda what: None)
+
+
+def test_what_is_in_the_data_does_not_raise_the_threshold() -> None:
+    """The sets are simulated from the declared model, so a planted effect must not show in their largest t."""
+    s = selector(0.08)
+    base = s.model((), s.train.score(s.train.null))
+    everything = s.model((0, 1), base.fit, 10)
+    assert s.evidence(everything, base).t > 10
+    assert largest_t(s, base.fit, [0, 1], seed=1) < 5
+
+
+def test_the_threshold_is_a_quantile_of_the_sets_and_the_same_for_a_seed() -> None:
+    s = selector(0.0)
+    base = s.model((), s.train.score(s.train.null)).fit
+    ts = [largest_t(s, base, [0, 1], seed) for seed in range(3)]
+    assert all(t >= 0 for t in ts)
+    assert len(set(ts)) > 1
+    assert calibrated(s, base, [0, 1], 3, 0) == np.quantile(ts, 0.95)
