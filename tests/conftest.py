@@ -9,6 +9,8 @@ import torch as th
 
 from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms import warm
+from sb3_rpto.experiments.planting import Planted, generate
+from sb3_rpto.tracing import Report, trace
 
 th.set_num_threads(1)
 
@@ -38,3 +40,20 @@ def small(cls, env=None, target=None, **kwargs):
     if cls.updates_dynamics and kwargs.get("dynamics", "ensemble") == "ensemble":
         settings |= {"dynamics_kwargs": SMALL_ENSEMBLE, "model_train_freq": 50}
     return cls("MlpPolicy", env, target_env=target, **{**settings, **kwargs})
+
+
+# --- tracing ----------------------------------------------------------------------------------------------------------
+
+TRACED = ["coulomb_friction", "torque_offset", "command_delay"]
+
+
+@pytest.fixture(scope="session")
+def planted() -> Planted:
+    """A pendulum with dry friction that its model does not have."""
+    return generate("pendulum", [("coulomb_friction", "large")], seed=0, episodes=6, duration=3.0)
+
+
+@pytest.fixture(scope="session")
+def report(planted: Planted) -> Report:
+    """What a trace of it finds; not to be changed."""
+    return trace(planted.xml, planted.measurements, ["pole.mass"], candidates=TRACED)

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import ALGORITHMS, SMALL_POLICY, pendulum, small
+from conftest import ALGORITHMS, SMALL_ENSEMBLE, SMALL_POLICY, pendulum, small
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
@@ -272,8 +272,6 @@ def test_source_data_fit_phi_0_and_spare_the_source(form, tmp_path):
 
 
 def small_from(sac, **kwargs):
-    from conftest import SMALL_ENSEMBLE
-
     settings = {"dynamics_kwargs": SMALL_ENSEMBLE, "source_steps": 8, "device": "cpu"}
     return RPTO.from_source(sac, pendulum(), pendulum(12.0), **settings, **kwargs)
 
