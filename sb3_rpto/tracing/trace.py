@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 
@@ -71,7 +72,7 @@ def trace(
     :raises ValueError: data and model do not fit together, or the data are too few
     """
     say = _steady(progress)
-    source, compiled = load_model(model)
+    spec, compiled = load_model(model)
     findings = [*data.findings, *check_against(compiled, data)]
     train, select, test = data.split(seed)
     findings += [f for f in train.findings if f not in findings]
@@ -117,9 +118,43 @@ def trace(
     final, intervals = refit(selection, problem, seed)
     # Both models are fitted to the same data before they are compared on the test runs.
     before = problem.fit(before.values, selector.free(()), iterations=10)
-    verdict = judge(first, last, bool(selection.model.effects))
+
     say(0.9, "predicting the test runs")
-    return _report(locals())
+    data = test if test.episodes else fitted
+    residuals_before = force_residuals(simulation, before.values, data)
+    residuals_after = force_residuals(simulation, final, data)
+    return Report(
+        verdict=judge(first, last, bool(selection.model.effects)),
+        declared=_declared(simulation, final, intervals),
+        effects=_kept(selection, simulation, final, intervals, selector.threshold, seed),
+        candidates=_fates(simulation, screening, selection),
+        adequacy_before=first,
+        adequacy_after=last,
+        before=horizon_errors(simulation, before.values, data, sigma, seed),
+        after=horizon_errors(simulation, final, data, sigma, seed),
+        floor=noise_floor(simulation, final, data, sigma, seed),
+        force_before=summary(residuals_before),
+        force_after=summary(residuals_after),
+        learnable=learnable_share(residuals_after, seed),
+        residuals_before=residuals_before,
+        residuals_after=residuals_after,
+        findings=findings,
+        noise=dict(zip(data.columns.qpos, sigma.tolist())),
+        runs={
+            name: sorted({e.run for e in part.episodes})
+            for name, part in (("train", train), ("select", select), ("test", test))
+        },
+        threshold=selector.threshold,
+        horizon=horizon,
+        seed=seed,
+        # An environment may hold other numbers than its file, which the specification would lose.
+        source=model if spec is None or isinstance(model, gym.Env) else spec,
+        simulation=simulation,
+        values_before=before.values,
+        values_after=final,
+        data=data,
+        sigma=sigma,
+    )
 
 
 def _steady(progress: Progress | None) -> Progress:
@@ -158,7 +193,7 @@ def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
     """The excited candidates, one of each class."""
     chosen: list[int] = []
     for i, effect in enumerate(selector.simulation.effects):
-        if effect.kind == "declared" or not screening.excited(i):
+        if _is_declared(effect) or not screening.excited(i):
             continue
         if not any(j in chosen for j in screening.alike(i)):
             chosen.append(i)
@@ -295,76 +330,41 @@ def _windows(
     return every, None
 
 
-def _report(state: dict[str, Any]) -> Report:
-    """Put together what :func:`trace` found."""
-    simulation: Simulation = state["simulation"]
-    selection: Selection = state["selection"]
-    screening: Screening | None = state["screening"]
-    final, intervals, seed = state["final"], state["intervals"], state["seed"]
-    test, sigma, fitted = state["test"], state["sigma"], state["fitted"]
-    threshold = state["selector"].threshold
+def _declared(simulation: Simulation, values: np.ndarray, intervals: np.ndarray) -> list[Traced]:
+    """The declared parameters with their fitted values."""
+    pairs = zip(simulation.effects, simulation.slices)
+    return [Traced(e.with_values(values[s]), intervals[:, s], [], 0.0, 0.0, 1.0) for e, s in pairs if _is_declared(e)]
+
+
+def _kept(
+    selection: Selection,
+    simulation: Simulation,
+    values: np.ndarray,
+    intervals: np.ndarray,
+    threshold: float,
+    seed: int,
+) -> list[Traced]:
+    """The effects that the model lacks, with their fitted values and the evidence for them."""
     rng = np.random.default_rng(seed)
+    found = []
+    for i in selection.model.effects:
+        evidence, s = selection.evidence[i], simulation.slices[i]
+        alike = [simulation.effects[j].label for j in selection.alike.get(i, [])]
+        effect = simulation.effects[i].with_values(values[s])
+        frequency = evidence.frequency(threshold, rng)
+        found.append(Traced(effect, intervals[:, s], alike, evidence.gain, evidence.t, frequency))
+    return found
+
+
+def _fates(simulation: Simulation, screening: Screening | None, selection: Selection) -> list[Candidate]:
+    """What became of each candidate."""
     labels = [e.label for e in simulation.effects]
+    candidates = [(i, e) for i, e in enumerate(simulation.effects) if not _is_declared(e)]
+    return [_candidate(i, e, screening, selection, labels) for i, e in candidates]
 
-    def part(i: int, values: np.ndarray) -> np.ndarray:
-        return values[..., simulation.slices[i]]
 
-    kept = list(selection.model.effects)
-    traced = []
-    for i in kept:
-        evidence = selection.evidence[i]
-        traced.append(
-            Traced(
-                simulation.effects[i].with_values(part(i, final)),
-                part(i, intervals),
-                [labels[j] for j in selection.alike.get(i, [])],
-                evidence.gain,
-                evidence.t,
-                evidence.frequency(threshold, rng),
-            )
-        )
-    known = [
-        Traced(e.with_values(part(i, final)), part(i, intervals), [], 0.0, 0.0, 1.0)
-        for i, e in enumerate(simulation.effects)
-        if isinstance(e, Declared)
-    ]
-    rows = [
-        _candidate(i, e, screening, selection, labels)
-        for i, e in enumerate(simulation.effects)
-        if not isinstance(e, Declared)
-    ]
-    data = test if test.episodes else fitted
-    before = state["before"].values
-    residual_before = force_residuals(simulation, before, data)
-    residual_after = force_residuals(simulation, final, data)
-    return Report(
-        verdict=state["verdict"],
-        declared=known,
-        effects=traced,
-        candidates=rows,
-        adequacy_before=state["first"],
-        adequacy_after=state["last"],
-        before=horizon_errors(simulation, before, data, sigma, seed),
-        after=horizon_errors(simulation, final, data, sigma, seed),
-        floor=noise_floor(simulation, final, data, sigma, seed),
-        force_before=summary(residual_before),
-        force_after=summary(residual_after),
-        learnable=learnable_share(residual_after, seed),
-        residuals_before=residual_before,
-        residuals_after=residual_after,
-        findings=state["findings"],
-        noise=dict(zip(data.columns.qpos, sigma.tolist())),
-        runs={name: sorted({e.run for e in state[name].episodes}) for name in ("train", "select", "test")},
-        threshold=threshold,
-        horizon=state["horizon"],
-        seed=seed,
-        source=state["source"] if state["source"] is not None else state["compiled"],
-        simulation=simulation,
-        values_before=before,
-        values_after=final,
-        data=data,
-        sigma=sigma,
-    )
+def _is_declared(effect: Effect) -> bool:
+    return isinstance(effect, Declared)
 
 
 def _candidate(

@@ -146,7 +146,7 @@ def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco
 
     A simulator's data are met by its own integrator and time step. The world knows no steps: measured data take steps
     of at most 2 ms, with the Runge-Kutta method of fourth order where it is to be ``fine``. A semi-implicit step of
-    1 ms errs by more than a milliradian in half a second.
+    1 ms errs by about a milliradian in half a second.
     """
     copy = model.__copy__()
     if not data.exact:

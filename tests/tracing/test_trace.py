@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -14,6 +15,7 @@ import pytest
 from simulated import PENDULUM, WITH_WHEEL, compiled, recorded
 from stable_baselines3.common.buffers import ReplayBuffer
 
+from sb3_rpto.effects.carry import load_corrected
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.experiments.planting import Planted, generate
@@ -290,6 +292,13 @@ def driven(friction: float) -> tuple[gym.Env, Measurements]:
         buffer.add(obs, after, action[None], np.array([reward]), np.array([terminated or truncated]), [{}])
         obs = after if not (terminated or truncated) else env.reset()[0]
     return nominal, Measurements.from_replay(buffer, nominal)
+
+
+def test_what_an_environment_changed_of_its_file_is_saved(tmp_path: Path) -> None:
+    env, data = driven(0.0)
+    env.unwrapped.model.dof_damping[0] = 0.123
+    trace(env, data, candidates=[], threads=1).save(tmp_path)
+    assert load_corrected(tmp_path).model.dof_damping[0] == 0.123
 
 
 def test_an_unchanged_environment_is_complete_without_error() -> None:
