@@ -21,6 +21,8 @@ TRUST = 3.0
 RIDGE = 30.0
 #: Finite differences, in plausible sizes: at a null value they are as wide as the effect must be to show.
 WIDE, NARROW = 1.0, 0.01
+#: Shares of a start's step that are tried.
+SHARES = (1.0, 0.2)
 #: Most simulations in one batch.
 CHUNK = 6000
 
@@ -240,35 +242,45 @@ class Problem:
             now = float(self.cost(r, starts, values, loss))
             reduced = self.reduce(r, jt, jx, starts, loss)
             for dampings in (damping * np.array([0.1, 1.0, 10.0, 100.0]), damping * np.array([1e4, 1e6])):
-                trial = self._try(values, starts, free, reduced, dampings if len(free) else dampings[:1])
+                trial = self._try(values, starts, free, reduced, dampings if len(free) else dampings[:1], loss)
                 costs = self.cost(trial.residuals, trial.starts, trial.values, loss)
                 best = int(np.argmin(costs))
                 if costs[best] < now:
+                    values, starts, r = trial.values[best], trial.starts[best], trial.residuals[best]
+                    damping = float(np.clip(dampings[best], 1e-6, 1e6))
                     break
-            else:
-                break
-            values, starts, r = trial.values[best], trial.starts[best], trial.residuals[best]
-            damping = float(np.clip(dampings[best], 1e-6, 1e6))
             if now - costs[best] < tolerance * now:
                 break
         return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, Loss.of(r))))
 
     def _try(
-        self, values: np.ndarray, starts: np.ndarray, free: np.ndarray, reduced: _Reduced, dampings: np.ndarray
+        self,
+        values: np.ndarray,
+        starts: np.ndarray,
+        free: np.ndarray,
+        reduced: _Reduced,
+        dampings: np.ndarray,
+        loss: Loss,
     ) -> _Trial:
-        """Simulate the steps of several dampings side by side."""
+        """Simulate the steps of several dampings side by side.
+
+        Each window takes what suits it of its start's own step: near an unstable pose a whole step may lead astray.
+        """
         count, tries = len(self.windows), len(dampings)
         steps = np.stack([self._step(values, free, reduced, d) for d in dampings])
-        moves = reduced.move + np.einsum("wxf,tf->twx", reduced.gain, steps[:, free] / self.size[free])
-        trial_starts = np.repeat(starts[None], tries, 0)
-        trial_starts[:, :, self.moving] -= moves
+        follow = np.einsum("wxf,tf->twx", reduced.gain, steps[:, free] / self.size[free])
+        moves = np.stack([share * (reduced.move + follow) for share in SHARES])
+        trial_starts = np.tile(starts, (len(SHARES), tries, 1, 1))
+        trial_starts[..., self.moving] -= moves
         trial_values = values + steps
         r = self.residuals(
-            np.repeat(trial_values, count, 0),
-            trial_starts.reshape(tries * count, -1),
-            np.tile(np.arange(count), tries),
-        )
-        return _Trial(trial_values, trial_starts, r.reshape(tries, count, -1))
+            np.tile(np.repeat(trial_values, count, 0), (len(SHARES), 1)),
+            trial_starts.reshape(len(SHARES) * tries * count, -1),
+            np.tile(np.arange(count), len(SHARES) * tries),
+        ).reshape(len(SHARES), tries, count, -1)
+        best = np.argmin(loss.energy(r, trial_starts), axis=0)
+        pick = best, np.arange(tries)[:, None], np.arange(count)
+        return _Trial(trial_values, trial_starts[pick], r[pick])
 
     def _step(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced, damping: float) -> np.ndarray:
         """A damped Gauss-Newton step within the bounds, (p,); what would leave them is held there."""
