@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import mujoco
@@ -93,12 +94,31 @@ class Simulation:
             self._setting(name).write(world, setting[:, None])
         prepare(world, active)
         world.qpos[:], world.qvel[:] = qpos, qvel
-        acting = [(e, x) for e, x in active if e.overrides("act")]
         out_q = np.empty((n, steps + 1, self.model.nq))
         out_v = np.empty((n, steps + 1, self.model.nv))
         out_q[:, 0], out_v[:, 0] = qpos, qvel
-        if acting or drive.enabled is not None:
-            switch = Switch(world, drive.enabled)
+        with quiet():
+            self._run(world, active, commands, drive.enabled, out_q, out_v)
+        bad = ~(np.isfinite(out_q).all(-1) & (np.abs(out_v) < 1e6).all(-1))
+        if bad.any():
+            bad = np.maximum.accumulate(bad, axis=1)
+            out_q[bad], out_v[bad] = np.nan, np.nan
+        return out_q, out_v
+
+    def _run(
+        self,
+        world: BatchWorld,
+        active: Active,
+        commands: np.ndarray,
+        enabled: np.ndarray | None,
+        out_q: np.ndarray,
+        out_v: np.ndarray,
+    ) -> None:
+        """Step through all commands and write what was reached after the start."""
+        steps = commands.shape[1]
+        acting = [(e, x) for e, x in active if e.overrides("act")]
+        if acting or enabled is not None:
+            switch = Switch(world, enabled)
             for k in range(steps):
                 world.ctrl[:] = commands[:, k]
                 switch(k)
@@ -114,11 +134,6 @@ class Simulation:
             # A rollout holds a simulation at its first warning; here that is the end of it.
             for i in np.flatnonzero(world.batch.warning[:, :, 1].any(axis=1)):
                 out_q[i, (out_q[i] == out_q[i, -1]).all(axis=-1)] = np.nan
-        bad = ~(np.isfinite(out_q).all(-1) & (np.abs(out_v) < 1e6).all(-1))
-        if bad.any():
-            bad = np.maximum.accumulate(bad, axis=1)
-            out_q[bad], out_v[bad] = np.nan, np.nan
-        return out_q, out_v
 
     def _world(self, n: int) -> BatchWorld:
         if n not in self._worlds:
@@ -134,6 +149,18 @@ class Simulation:
 
 
 Active = Sequence[tuple[Effect, np.ndarray]]
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep MuJoCo from printing a line for every simulation that became unstable: NaN says so."""
+    usual, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    silent.logto_console = silent.logto_file = False
+    silent.set()
+    try:
+        yield
+    finally:
+        usual.set()
 
 
 def prepare(world: World, active: Active) -> None:

@@ -33,9 +33,9 @@ def largest_t(selector: Selector, base: Fit, chosen: list[int], seed: int) -> fl
     rng = np.random.default_rng(seed)
     train = _complete(selector.train, base, rng)
     select = None if selector.select is None else _complete(selector.select, selector.select.score(base.values), rng)
-    ghost = Selector(train, select, np.inf, selector.say, selector.horizon)
+    ghost = Selector(train, select, selector.threshold, selector.say, selector.horizon)
     nothing = ghost.model((), base)
-    outcome = ghost.eliminate(ghost.together(chosen, nothing.fit))
+    outcome = ghost.eliminate(ghost.together(chosen, nothing.fit), limit=np.inf)
     found = [e.t for _, e in outcome.dropped.values() if isinstance(e, Evidence) and e.gain > 0]
     return max(found, default=0.0)
 

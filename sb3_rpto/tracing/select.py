@@ -232,8 +232,11 @@ class Selector:
         """What ``with_`` gains over ``without`` on the select windows."""
         return compare(without.errors, with_.errors, self.blocks)
 
-    def eliminate(self, full: Model) -> Selection:
-        """Drop the effect whose removal costs least until all that remain are needed."""
+    def eliminate(self, full: Model, limit: float = SEEMS) -> Selection:
+        """Drop the effect whose removal costs least until all that remain seem to matter.
+
+        :param limit: of t; lower than the threshold, as much else may still be wrong: the last word is `judge`'s
+        """
         current, step = full, 0
         outcome = Selection(full)
         while current.effects:
@@ -245,8 +248,7 @@ class Selector:
                 trial = self.model([e for e in current.effects if e not in drop], current.fit)
                 evidence = self.evidence(current, trial)
                 self.say(f"{len(trial.effects)} effects left")
-                # What seems to matter stays while much else is wrong: the last word is `judge`'s.
-                if not evidence.clear(min(SEEMS, self.threshold)):
+                if not evidence.clear(limit):
                     reduced = trial
                     for e in drop:
                         outcome.dropped[e] = (step, evidence)
@@ -286,10 +288,9 @@ class Selector:
                 self.say(f"{self.simulation.effects[e].label} or {self.simulation.effects[other].label}")
                 begin = self._translated(current, best, other)
                 trial = self.model([i for i in current.effects if i != best] + [other], begin, REFIT + 3)
-                seems = min(SEEMS, self.threshold)
-                if self.evidence(trial, current).clear(seems):
+                if self.evidence(trial, current).clear(SEEMS):
                     current, alike, best = trial, [], other
-                elif not self.evidence(current, trial).clear(seems):
+                elif not self.evidence(current, trial).clear(SEEMS):
                     alike.append(other)
                     if self._simpler(other, best):
                         current, best = trial, other
