@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sb3_rpto.tracing.identify import Fit, Problem
-from sb3_rpto.tracing.select import Evidence, Selector
+from sb3_rpto.tracing.select import Evidence, Selection, Selector
 
 #: t* is this quantile of the largest t on complete data.
 LEVEL = 0.95
@@ -35,7 +35,7 @@ def largest_t(selector: Selector, base: Fit, chosen: list[int], seed: int) -> fl
     select = None if selector.select is None else _complete(selector.select, selector.select.score(base.values), rng)
     ghost = Selector(train, select, selector.threshold, selector.say, selector.horizon)
     nothing = ghost.model((), base)
-    outcome = ghost.eliminate(ghost.together(chosen, nothing.fit), limit=np.inf)
+    outcome = ghost.eliminate(Selection(ghost.together(chosen, nothing.fit)), np.inf)
     found = [e.t for _, e in outcome.dropped.values() if isinstance(e, Evidence) and e.gain > 0]
     return max(found, default=0.0)
 

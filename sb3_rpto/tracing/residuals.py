@@ -159,8 +159,10 @@ def typical(simulation: Simulation, residuals: list[ForceResidual]) -> Typical:
     def high(values: np.ndarray) -> np.ndarray:
         return np.maximum(np.quantile(np.abs(values), 0.95, axis=0), 1e-9)
 
+    load, needed = high(rows["load"]), high(rows["load"] + rows["force"])
     return Typical(
-        torque=high(rows["load"] + rows["force"]),
+        # Feet on the ground need forces that no motor gives: what acts at a driven joint is measured by its motor.
+        torque=np.where(load > 1e-6, np.minimum(needed, 2 * load), needed),
         velocity=high(rows["qvel"]),
         inertia=np.maximum(np.diag(full), 1e-9),
         span=np.maximum(np.ptp(rows["qpos"], axis=0), 1e-3),

@@ -31,8 +31,11 @@ SEEMS = 1.5
 ROUNDS, PROMISING = 3, 4
 #: Typical window error, in units of the noise, that leaves nothing to look forward to.
 ENOUGH = 1.1
-#: Candidates for a substitution are the likest so many.
-SUBSTITUTES = 5
+#: Candidates for a substitution are the likest so many, of at least this cosine.
+SUBSTITUTES, LIKE = 5, 0.3
+
+#: Errors below this many units of noise are none: exact data are met to rounding, where any ratio may be large.
+NOTHING = 0.5
 
 Say = Callable[[str], None]
 
@@ -68,7 +71,7 @@ def compare(without: np.ndarray, with_: np.ndarray, blocks: np.ndarray) -> Evide
     :param with_: errors of the same windows, (W,)
     :param blocks: number of the block of each window, (W,)
     """
-    ratio = np.log(np.maximum(without, 1e-12)) - np.log(np.maximum(with_, 1e-12))
+    ratio = np.log(np.maximum(without, NOTHING)) - np.log(np.maximum(with_, NOTHING))
     return _evidence(np.array([ratio[blocks == b].mean() for b in np.unique(blocks)]))
 
 
@@ -177,21 +180,23 @@ class Selector:
         return self.model(effects, best)
 
     def _best_few(self, effects: Sequence[int], base: Fit) -> np.ndarray:
-        """Parameters after the effects that lower the cost of every third window most have joined one by one."""
+        """Parameters after the kinds that lower the cost of every third window most have joined one by one.
+
+        A kind joins at all its places at once: the joints of a machine are built alike.
+        """
         some = np.arange(0, len(self.train.windows), 3)
         part, chosen = self.train.on(some), list[int]()
         fit = part.fit(base.values, self.free(()), base.starts[some], REFIT)
-        for _ in range(min(ROUNDS, len(effects))):
-            self.say(f"another start, with {len(chosen) + 1} of the candidates")
-            fits = self._each(part, fit, chosen, [e for e in effects if e not in chosen])
-            best = min(fits, key=lambda e: fits[e].cost)
-            chosen.append(best)
+        kinds: dict[str, list[int]] = {}
+        for e in effects:
+            kinds.setdefault(self.simulation.effects[e].kind, []).append(e)
+        for _ in range(min(ROUNDS, len(kinds))):
+            self.say(f"another start, with {len(chosen)} of the candidates")
+            fits = {k: part.fit(fit.values, self.free([*chosen, *g]), fit.starts, REFIT) for k, g in kinds.items()}
+            best = min(fits, key=lambda k: fits[k].cost)
+            chosen += kinds.pop(best)
             fit = fits[best]
         return fit.values
-
-    def _each(self, part: Problem, begin: Fit, chosen: Sequence[int], outside: Sequence[int]) -> dict[int, Fit]:
-        """Short fits with one more effect each."""
-        return {e: part.fit(begin.values, self.free([*chosen, e]), begin.starts, REFIT + 1) for e in outside}
 
     def model(self, effects: Sequence[int], begin: Fit, iterations: int = REFIT) -> Model:
         """Fit a model from the optimum of another, without the effects that it lacks."""
@@ -232,13 +237,9 @@ class Selector:
         """What ``with_`` gains over ``without`` on the select windows."""
         return compare(without.errors, with_.errors, self.blocks)
 
-    def eliminate(self, full: Model, limit: float = SEEMS) -> Selection:
-        """Drop the effect whose removal costs least until all that remain seem to matter.
-
-        :param limit: of t; lower than the threshold, as much else may still be wrong: the last word is `judge`'s
-        """
-        current, step = full, 0
-        outcome = Selection(full)
+    def eliminate(self, outcome: Selection, limit: float) -> Selection:
+        """Drop the effect whose removal costs least until all that remain have a t above the limit."""
+        current, step = outcome.model, max((step for step, _ in outcome.dropped.values()), default=0)
         while current.effects:
             step += 1
             order, costs = self.removal_costs(current)
@@ -276,12 +277,9 @@ class Selector:
 
     def substitute(self, selection: Selection, screening: Screening) -> Selection:
         """Try the likest other effects in the place of each kept one; keep the better, name those that do as well."""
-        current = selection.model
+        current = self._alike_everywhere(selection.model, screening)
         for e in current.effects:
-            others = [i for i in np.argsort(-screening.cosine[e]) if i != e and i not in current.effects]
-            others = [int(i) for i in others if screening.excited(int(i)) and screening.cosine[e, i] > 0.3][
-                :SUBSTITUTES
-            ]
+            others = self._likest(e, current.effects, screening)
             best = e
             alike: list[int] = []
             for other in others:
@@ -302,6 +300,34 @@ class Selector:
             if e in current.effects
         }
         return selection
+
+    def _alike_everywhere(self, model: Model, screening: Screening) -> Model:
+        """Try each kept kind in the place of all others that it resembles, at once: one alone may look no better."""
+        kind_of = [e.kind for e in self.simulation.effects]
+        for kind in sorted({kind_of[e] for e in model.effects}):
+            same = [i for i, k in enumerate(kind_of) if k == kind and screening.excited(i)]
+            nearest = {e: max(same, key=lambda i: screening.cosine[e, i], default=e) for e in model.effects}
+            swaps = {e: i for e, i in nearest.items() if kind_of[e] != kind and screening.cosine[e, i] > LIKE}
+            trial_effects = sorted({swaps.get(e, e) for e in model.effects})
+            if len(swaps) < 2 or len(trial_effects) < len(model.effects):
+                continue
+            self.say(f"{kind} in all places")
+            begin = model.fit
+            for old, new in swaps.items():
+                moved = self._translated(model, old, new).values[self.simulation.slices[new]]
+                begin = replace(begin, values=begin.values.copy())
+                begin.values[self.simulation.slices[new]] = moved
+            trial = self.model(trial_effects, begin, 2 * REFIT)
+            if self.evidence(trial, model).clear(SEEMS):
+                model = trial
+        return model
+
+    def _likest(self, effect: int, kept: Sequence[int], screening: Screening) -> list[int]:
+        """What to try in the place of an effect: kinds that are kept elsewhere first, as joints are built alike."""
+        kinds = {self.simulation.effects[i].kind for i in kept}
+        near = [i for i in np.argsort(-screening.cosine[effect]).tolist() if screening.cosine[effect, i] > LIKE]
+        near = [i for i in near if i != effect and i not in kept and screening.excited(i)]
+        return sorted(near, key=lambda i: self.simulation.effects[i].kind not in kinds)[:SUBSTITUTES]
 
     def _translated(self, model: Model, old: int, new: int) -> Fit:
         """Where to begin with ``new`` in the place of ``old``: where it does the likest, to first order."""
@@ -363,10 +389,10 @@ class Selector:
         some = np.arange(0, len(self.train.windows), 3)
         part, begin = self.train.on(some), model.fit.starts[some]
         base = part.fit(model.fit.values, self.free(model.effects), begin, 3)
-        gains = {
-            e: max(float(np.mean(np.log(base.errors) - np.log(fit.errors))), 1 - fit.cost / base.cost)
-            for e, fit in self._each(part, base, model.effects, outside).items()
-        }
+        gains = {}
+        for e in outside:
+            fit = part.fit(base.values, self.free([*model.effects, e]), base.starts, REFIT + 1)
+            gains[e] = max(float(np.mean(np.log(base.errors) - np.log(fit.errors))), 1 - fit.cost / base.cost)
         best = sorted(outside, key=lambda e: -gains[e])[:PROMISING]
         return [e for e in best if gains[e] > GAIN]
 

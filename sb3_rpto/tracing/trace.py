@@ -23,7 +23,7 @@ from sb3_rpto.tracing.model_checks import check_against
 from sb3_rpto.tracing.report import Candidate, Report, Traced
 from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary, typical
 from sb3_rpto.tracing.screen import Screening, screen
-from sb3_rpto.tracing.select import Model, Selection, Selector
+from sb3_rpto.tracing.select import SEEMS, Model, Selection, Selector
 from sb3_rpto.tracing.windows import Windows, cut, discretised, noise_levels
 
 #: Most windows to fit, and to select on.
@@ -209,8 +209,10 @@ def search(selector: Selector, rough: Selector, base: Model, screening: Screenin
     """
     chosen = worth_fitting(selector, screening)
     say(0.2, f"fitting {len(chosen)} candidates together")
-    selection = rough.eliminate(rough.together(chosen, rough.model((), base.fit).fit))
+    # What seems to matter stays while much else may still be wrong.
+    selection = rough.eliminate(Selection(rough.together(chosen, rough.model((), base.fit).fit)), SEEMS)
     selection = rough.add_back(selection, chosen)
+    selection = rough.eliminate(selection, rough.threshold)
     say(0.7, "trying like effects in their place")
     selection = rough.substitute(selection, screening)
     selection.model = selector.model(selection.model.effects, selection.model.fit, iterations=10)

@@ -29,7 +29,7 @@ def eliminated(s: Selector) -> Selection:
     count = range(len(s.simulation.effects))
     base = s.model((), s.train.score(s.train.null))
     full = s.together(list(count), base.fit)
-    return s.eliminate(full)
+    return s.eliminate(Selection(full), s.threshold)
 
 
 @cache
