@@ -9,8 +9,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics
+from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
-from sb3_rpto.dynamics.physical import PhysicalDynamics, cartpole_constants
 from sb3_rpto.envs.rules import task_rules
 
 BACKENDS = ("ensemble", "physical")
@@ -49,7 +49,7 @@ def dynamics_config(backend: str, env: VecEnv, kwargs: dict[str, Any], declared:
 def make_dynamics(config: dict[str, Any], observation_space: spaces.Box, action_space: spaces.Box) -> Dynamics:
     """Build the model that :func:`dynamics_config` described."""
     arguments = dict(config)
-    classes: dict[str, Any] = {"ensemble": EnsembleDynamics, "physical": PhysicalDynamics}
+    classes: dict[str, Any] = {"ensemble": EnsembleDynamics, "physical": CartPoleDynamics}
     try:
         return classes[arguments.pop("backend")](observation_space, action_space, **arguments)
     except TypeError as error:

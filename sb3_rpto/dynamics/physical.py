@@ -1,361 +1,283 @@
-"""A simulator as trainable dynamics: phi is a few named physical constants, with exact gradients."""
+"""A MuJoCo simulator as trainable dynamics: phi is named numbers of its model, and effects that it lacked."""
 
 from __future__ import annotations
 
-import difflib
-import math
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
+import mujoco
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
-from torch import nn
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
-from sb3_rpto.envs.cartpole import CartPoleParameters, cartpole_reward, cartpole_step, cartpole_termination
+from sb3_rpto.dynamics.onestep import OneStep, Steps, as_steps
+from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
+from sb3_rpto.effects.effect import from_json
+from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.observations import StateMap, env_name, mujoco_model, single_env, state_map
+from sb3_rpto.envs.state import copy_env
 
-#: The constants that may be declared, with their default bounds; None is a tenth to ten times the nominal value.
-DECLARABLE: dict[str, tuple[float, float] | None] = {
-    "gravity": None,
-    "cart_mass": None,
-    "pole_mass": None,
-    "pole_length": None,
-    "force_scale": None,
-    "cart_friction": (0.0, 10.0),
-    "pole_friction": (0.0, 0.5),
-}
-
-#: Only the newest transitions are fitted: a handful of constants is known long before.
-MAX_TRANSITIONS = 5000
-#: Directions whose curvature is below this share of the largest count as not identified by the data.
-SINGULAR = 1e-8
+#: Fits use the newest transitions: a few numbers are known long before.
+MAX_TRANSITIONS = 500
+#: A fit stops when no parameter moves by more than this share of its scale.
+STILL = 1e-6
 
 
-def cartpole_constants(env: gym.Env | VecEnv) -> dict[str, float]:
-    """The constants of a cart-pole, read through its wrappers.
+def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
+    """What :class:`PhysicalDynamics` must know of a gymnasium MuJoCo environment; plain data that pickles.
 
-    :param env: a (wrapped or vectorised) :class:`~sb3_rpto.envs.cartpole.ContinuousCartPoleEnv`
-    :return: every field of :class:`~sb3_rpto.envs.cartpole.CartPoleParameters`
-    :raises ValueError: if there is no cart-pole below the wrappers
+    :param env: with all its wrappers; of a VecEnv the first
+    :raises ValueError: no MuJoCo model, states that cannot be recovered from observations, actions that are not the
+        commands of the actuators
     """
-    try:
-        found = env.get_attr("parameters")[0] if isinstance(env, VecEnv) else env.get_wrapper_attr("parameters")
-    except AttributeError:
-        found = None
-    if not isinstance(found, CartPoleParameters):
-        raise ValueError(f"env has no cart-pole parameters: {env}; pass a ContinuousCartPoleEnv")
-    return asdict(found)
-
-
-class _Linearisation(NamedTuple):
-    """The weighted residuals and their derivative at one phi."""
-
-    residual: th.Tensor  # (n, d)
-    jacobian: th.Tensor  # (n, d, p)
-
-    @property
-    def loss(self) -> float:
-        return float(self.residual.pow(2).sum())
-
-    @property
-    def gradient(self) -> th.Tensor:  # (p,), of half the loss
-        return th.einsum("ndp,nd->p", self.jacobian, self.residual)
-
-    @property
-    def hessian(self) -> th.Tensor:  # (p, p), Gauss-Newton's, of half the loss
-        return th.einsum("ndp,ndq->pq", self.jacobian, self.jacobian)
+    single = single_env(env)
+    model, recover = mujoco_model(single), state_map(single)
+    if single.action_space.shape != (model.nu,):
+        raise ValueError(
+            f"{env_name(single)}: actions have shape {single.action_space.shape}, the model {model.nu} actuators; "
+            "dynamics='physical' needs actions that are the commands of the actuators"
+        )
+    frame_skip = getattr(single.unwrapped, "frame_skip", None)
+    if frame_skip is None:
+        raise ValueError(f"{env_name(single)} has no frame_skip; derive it from gymnasium.envs.mujoco.MujocoEnv")
+    return {"model": model.__copy__(), "recover": recover, "frame_skip": int(frame_skip)}
 
 
 class PhysicalDynamics(Dynamics):
-    r"""The cart-pole simulator with trainable constants.
+    r"""Any gymnasium MuJoCo simulator with trainable numbers and effects.
 
-    phi is kept as one coordinate per declared constant, zero at its nominal value: log(value / nominal) where the lower
-    bound is positive, (value - nominal) / (upper - lower) otherwise. :meth:`fit` minimises the weighted squared error
+    :meth:`fit` minimises the robust weighted one-step error
 
-    .. math:: \sum_i w_i \, \lVert (f_\phi(s_i, a_i) - s'_i) / \sigma \rVert^2 / (d \sum_i w_i)
+    .. math:: \sum_i w_i \sum_j \rho(((f_\phi(s_i, a_i) - s'_i)_j / \sigma_j)
 
-    (sigma: each dimension's standard one-step change in the data, d: dimensions that change at all) by
-    Levenberg-Marquardt steps: Gauss-Newton's direction, its length limited to ``max_step`` so that the source moves
-    smoothly towards the target (the curriculum of RTO), and to the point as soon as that is within reach. A step that
-    would raise the error is shortened until it does not. Directions that the data do not determine have no component
-    in such a step, so phi stays at its nominal value along them. There is no optimizer and no randomness.
+    over positions and velocities (sigma: their standard one-step change; rho: soft-L1) by Gauss-Newton steps within the
+    parameters' bounds and within a trusted size, so that the source moves smoothly towards the target; a step that
+    would raise the error is shortened. Derivatives are finite differences, all columns and transitions in one
+    :class:`mujoco.batch.Batch`. Parameters that the data do not show stay where they are, and are named in a warning.
 
-    :param observation_space: Box (4,)
-    :param action_space: Box (1,)
-    :param constants: fields of :class:`~sb3_rpto.envs.cartpole.CartPoleParameters`: the nominal values
-        (:func:`cartpole_constants` reads them off an environment); missing ones take their default
-    :param declared: names of the constants to train, out of :data:`DECLARABLE`
-    :param bounds: (lower, upper) of declared constants in their units; default: :data:`DECLARABLE`'s
-    :param max_step: largest change of a coordinate in one step; 0.0025 doubles a constant in about 280 steps
-    :param max_steps: bounded steps that a fit takes at most, unless it is told otherwise
-    :raises ValueError: for spaces that are not a cart-pole's, unknown or repeated names, bounds that are empty,
-        infinite, unphysical or do not hold the nominal value, and ``max_step`` <= 0
+    The source world is the environment itself with phi in it (:meth:`effects`), so rewards, terminations and resets are
+    the environment's own.
+
+    :param observation_space: the environment's
+    :param action_space: the environment's; actions are the commands of the actuators
+    :param model: the simulator's model
+    :param recover: states from observations, see :func:`sb3_rpto.envs.observations.state_map`
+    :param frame_skip: simulation steps in one step of the environment
+    :param declared: names of the model's numbers to train, as :func:`sb3_rpto.effects.declare` takes them
+    :param effects: further effects to train, as :meth:`~sb3_rpto.effects.effect.Effect.to_json` describes them
+    :param max_step: largest change of a parameter in one step, in scales: its nominal value, or what is plausible
+    :param max_steps: steps that a fit takes at most, unless it is told otherwise
+    :param randomise: each source episode has a phi of its own, drawn from a normal distribution around the estimate
+        with so many times its standard deviation; 0: the estimate itself
+    :param threads: that simulate; 0: one for each core
+    :raises ValueError: unknown names (with the near ones), spaces that are not the model's, values out of range
     """
 
     rollout: ClassVar[Literal["branches", "episodes"]] = "episodes"
 
-    _lower: th.Tensor
-    _upper: th.Tensor
-    _nominal: th.Tensor
-    _is_log: th.Tensor
-    _width: th.Tensor
+    _values: th.Tensor
+    _deviation: th.Tensor
 
     def __init__(
         self,
         observation_space: spaces.Box,
         action_space: spaces.Box,
         *,
-        constants: Mapping[str, float],
-        declared: Sequence[str] = ("pole_length",),
-        bounds: Mapping[str, tuple[float, float]] | None = None,
-        max_step: float = 0.0025,
-        max_steps: int = 2000,
+        model: mujoco.MjModel,
+        recover: StateMap,
+        frame_skip: int,
+        declared: Sequence[str] = (),
+        effects: Sequence[Mapping[str, Any]] = (),
+        max_step: float = 0.1,
+        max_steps: int = 10,
+        randomise: float = 0.0,
+        threads: int = 0,
     ) -> None:
         super().__init__(observation_space, action_space)
-        if observation_space.shape != (4,) or action_space.shape != (1,):
-            raise ValueError(
-                f"PhysicalDynamics simulates the cart-pole (4 observations, 1 action), not spaces of shape "
-                f"{observation_space.shape} and {action_space.shape}; use dynamics='ensemble' for other tasks"
-            )
-        if not max_step > 0:
-            raise ValueError(f"max_step must be positive, not {max_step!r}")
-        self.nominal = _complete(constants)
-        self._thresholds = CartPoleParameters(**self.nominal)
-        self.declared = _checked_names(declared)
-        self.bounds = _checked_bounds(self.declared, self.nominal, bounds or {})
-        self.max_step = max_step
-        self.max_steps = max_steps
+        for name, value, least in (
+            ("max_step", max_step, 1e-9),
+            ("max_steps", max_steps, 1),
+            ("randomise", randomise, 0),
+        ):
+            if not value >= least:
+                raise ValueError(f"{name} must be at least {least:g}, not {value!r}")
+        if action_space.shape != (model.nu,):
+            raise ValueError(f"action_space has shape {action_space.shape}, the model {model.nu} actuators")
+        self.model, self.recover, self.frame_skip = model, recover, frame_skip
+        self.max_step, self.max_steps, self.randomise = max_step, max_steps, randomise
+        self.threads = threads
+        self._twin: CorrectedEnv | None = None
+        self._unseen: tuple[str, ...] = ()
+        known: list[Effect] = [*declare(model, declared)]
+        self._adopt([*known, *map(from_json, effects)])
 
-        lower, upper = th.tensor([self.bounds[name] for name in self.declared], dtype=th.float64).T
-        nominal = th.tensor([self.nominal[name] for name in self.declared], dtype=th.float64)
-        is_log, width = lower > 0, upper - lower
-        # The rest follows from the arguments, so the checkpoint holds phi alone.
-        for key, value in {
-            "_nominal": nominal,
-            "_is_log": is_log,
-            "_width": width,
-            "_lower": th.where(is_log, (lower / nominal).log(), (lower - nominal) / width),
-            "_upper": th.where(is_log, (upper / nominal).log(), (upper - nominal) / width),
-        }.items():
-            self.register_buffer(key, value, persistent=False)
-        self.coordinates = nn.Parameter(th.zeros(len(self.declared), dtype=th.float64))
+    def _adopt(self, effects: Sequence[Effect]) -> None:
+        """Let phi be the values of these effects."""
+        self.simulation = Simulation(self.model, effects, self.threads)
+        gears = np.abs(self.model.actuator_gear[:, 0]) * np.max(
+            np.abs(self.model.actuator_ctrlrange), axis=1, initial=0
+        )
+        scales = Scales(torque=float(gears.max(initial=1.0)))
+        parameters = [p for e in self.simulation.effects for p in e.parameters]
+        self.names = [_name(e, p.name) for e in self.simulation.effects for p in e.parameters]
+        self._lower, self._upper = (np.array([getattr(p, b) for p in parameters]) for b in ("lower", "upper"))
+        values = self.simulation.values()
+        self._scale = np.maximum(np.abs(values), [p.size_for(scales) for p in parameters] if parameters else 0.0)
+        device = self._values.device if "_values" in self._buffers else None
+        self.register_buffer("_values", th.as_tensor(values, dtype=th.float64, device=device))
+        self.register_buffer("_deviation", th.zeros(len(values), dtype=th.float64, device=device))
 
-    def values(self, coordinates: th.Tensor) -> th.Tensor:
-        """The declared constants in their units, (..., p), at ``coordinates`` (..., p); differentiable."""
-        return th.where(self._is_log, self._nominal * coordinates.exp(), self._nominal + self._width * coordinates)
-
-    def simulate(self, observations: th.Tensor, actions: th.Tensor, coordinates: th.Tensor) -> th.Tensor:
-        """Next observations (n, 4) in float64 at any phi; differentiable in all arguments.
-
-        :param observations: (n, 4)
-        :param actions: (n, 1)
-        :param coordinates: (p,), or (n, p) for a world of its own for each transition; see the class
-        """
-        current = dict(zip(self.declared, self.values(coordinates).unbind(dim=-1)))
-        return cartpole_step(observations.double(), actions.double(), {**self.nominal, **current})
-
-    @th.enable_grad()
-    def linearise(
-        self, observations: th.Tensor, actions: th.Tensor, coordinates: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
-        """Next observations (n, 4) and their exact derivative by the coordinates, (n, 4, p), at ``coordinates`` (p,).
-
-        Reverse mode over one copy of phi for each transition: several times faster than ``torch.func.jacfwd`` here.
-        """
-        copies = coordinates.detach().repeat(len(observations), 1).requires_grad_()
-        reached = self.simulate(observations, actions, copies)
-        rows = [
-            th.autograd.grad(column.sum(), copies, retain_graph=True, allow_unused=True, materialize_grads=True)[0]
-            for column in reached.unbind(dim=1)
-        ]
-        return reached.detach(), th.stack(rows, dim=1)
+    # ------------------------------------------------------------------ phi
 
     @property
-    def constants(self) -> dict[str, float]:
-        """All constants with the current phi: ``ContinuousCartPoleEnv(**model.constants)`` is the corrected world."""
-        return {**self.nominal, **self.describe()}
+    def values(self) -> np.ndarray:
+        """phi in its units, (p,)."""
+        return self._values.cpu().numpy()
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviation of phi in its units, (p,): of the last fit, robust against correlated errors; 0 before."""
+        return self._deviation.cpu().numpy()
+
+    def effects(self, generator: np.random.Generator | None = None) -> list[Effect]:
+        """Declared numbers and effects with the values of phi, for :class:`~sb3_rpto.effects.CorrectedEnv`.
+
+        :param generator: draws phi from its uncertainty, ``randomise`` times as wide; None: the estimate
+        """
+        values = self.values
+        if generator is not None and self.randomise > 0:
+            values = values + self.randomise * self.deviation * generator.standard_normal(len(values))
+            values = np.clip(values, self._lower, self._upper)
+        return [e.with_values(values[s]) for e, s in zip(self.simulation.effects, self.simulation.slices)]
+
+    def adopt(self, found: Sequence[Effect]) -> None:
+        """Take effects that were traced into phi, and the values that declared numbers had beside them.
+
+        :param found: declared numbers by the names that were declared, and further effects
+        """
+        mine = {e.label: e for e in self.effects()}
+        for effect in found:
+            old = mine.get(effect.label)
+            mine[effect.label] = effect if old is None else old.with_values(effect.values)
+        self._adopt(list(mine.values()))
+
+    def added(self) -> list[dict[str, Any]]:
+        """The effects beside the declared numbers, as ``effects=`` takes them."""
+        return [e.to_json() for e in self.effects() if not isinstance(e, Declared)]
 
     def describe(self) -> dict[str, float]:
-        """The declared constants by name, in their units."""
-        values = self.values(self.coordinates.detach().double()).tolist()
-        # exp(log(bound)) may miss the bound by a rounding error, and a friction of -1e-18 is no world.
-        return {name: min(max(x, self.bounds[name][0]), self.bounds[name][1]) for name, x in zip(self.declared, values)}
+        """phi by name, with the standard deviations."""
+        values = dict(zip(self.names, map(float, self.values)))
+        return values | {f"{name}_std": float(d) for name, d in zip(self.names, self.deviation)}
+
+    # ------------------------------------------------------------------ prediction
+
+    def attach(self, env: gym.Env | VecEnv) -> None:
+        """Give the environment whose rewards, terminations and observations :meth:`step` answers with; it is copied.
+
+        :raises ValueError: it cannot be copied
+        """
+        twin = copy_env(single_env(env))
+        if twin is None:
+            raise ValueError(f"{env} cannot be copied; give dynamics='physical' an environment that can")
+        twin.reset(seed=0)
+        self._twin = CorrectedEnv(twin, self.effects())
 
     @th.no_grad()
     def step(self, observations: th.Tensor, actions: th.Tensor, deterministic: bool = False) -> Prediction:
-        """One step of the simulator, computed in float64 and returned in the observations' type.
+        """One step of the corrected environment from each state; commands from before it count as the same.
 
-        :param observations: (n, 4)
-        :param actions: (n, 1), clipped to [-1, 1] as the environment does
+        :param observations: (n, observation_dim)
+        :param actions: (n, action_dim)
         :param deterministic: no effect, the simulator always is
+        :raises RuntimeError: before :meth:`attach`
         """
-        reached = self.simulate(observations, actions, self.coordinates.double())
-        terminations = cartpole_termination(reached, self._thresholds)
-        next_observations = reached.to(observations.dtype)
-        return Prediction(next_observations, cartpole_reward(next_observations, self._thresholds), terminations)
+        if self._twin is None:
+            raise RuntimeError("step() needs the environment's rewards: call attach(env) first")
+        twin, base = self._twin, self._twin.unwrapped
+        twin.set_effects(self.effects())
+        states = self.recover(observations.cpu().numpy())
+        qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
+        following, rewards, ends = [], [], []
+        for q, v, action in zip(qpos, qvel, actions.cpu().numpy()):
+            twin.reset()
+            base.set_state(q, v)  # type: ignore[attr-defined]
+            observation, reward, terminated, _, _ = twin.step(action)
+            following.append(observation)
+            rewards.append(float(reward))
+            ends.append(terminated)
+        device = observations.device
+        return Prediction(
+            th.as_tensor(np.array(following), dtype=observations.dtype, device=device),
+            th.as_tensor(rewards, device=device),
+            th.as_tensor(ends, device=device),
+        )
 
-    @th.no_grad()
     def error(self, data: Transitions) -> float:
-        """Root mean squared one-step error on ``data``, in units of each dimension's standard one-step change."""
-        return relative_error(self.simulate(data.observations, data.actions, self.coordinates.double()), data)
+        """As in :class:`~sb3_rpto.dynamics.base.Dynamics`, of positions and velocities in place of observations."""
+        steps = self._steps(data)
+        shown = steps.compared
+        if not len(steps) or not shown.any():
+            return float("nan")
+        begun = np.concatenate([steps.qpos, steps.qvel], axis=1)
+        reached = np.nan_to_num(steps.reach(self.simulation, self.values[None])[0])
+        before, predicted, after = (th.as_tensor(x[:, shown]) for x in (begun, reached, steps.reached))
+        return relative_error(predicted, Transitions(before, before, before, after, before))
+
+    def _steps(self, data: Transitions) -> Steps:
+        return as_steps(data, self.recover, self.model, self.frame_skip)
+
+    # ------------------------------------------------------------------ the fit
 
     def fit(
         self, data: Transitions, weights: th.Tensor | None = None, max_steps: int | None = None
     ) -> dict[str, float]:
-        """Move phi towards ``data`` by at most ``max_steps`` bounded steps; stops where no step improves.
+        """Move phi towards ``data`` by at most ``max_steps`` trusted steps; see the class.
 
-        :param data: transitions, oldest first; the newest :data:`MAX_TRANSITIONS` with a positive weight are used
-        :param weights: (n,), one non-negative weight a transition; None weighs all alike
-        :param max_steps: cap of steps; None takes the constructor's
-        :return: ``loss`` (mean weighted squared error after the fit), ``steps`` taken, and for every declared constant
-            its value and standard error ``<name>_se`` (see :meth:`_standard_errors`; infinite where the data do not
-            determine it)
-        :raises ValueError: for weights of the wrong shape, negative, not finite or all zero, and data not finite
+        :param data: transitions, of which the newest are fitted
+        :param weights: (n,), RTO's; None weighs all alike
+        :param max_steps: default: that of the class
+        :return: ``steps`` taken, and how many transitions were ``left_out`` (clipped or unknown states)
+        :raises ValueError: weights of another shape
         """
-        data, weight = _checked_data(data, weights)
-        change = (data.next_observations - data.observations).double()
-        mean = weight @ change
-        scale = (weight @ (change - mean).pow(2)).sqrt()
-        moving = (scale > 1e-8).nonzero()[:, 0]
-        root = (weight / max(len(moving), 1)).sqrt()[:, None]
-
-        def linearise(coordinates: th.Tensor) -> _Linearisation:
-            reached, jacobian = self.linearise(data.observations, data.actions, coordinates)
-            missed = reached - data.next_observations.double()
-            unit = root / scale[moving]
-            return _Linearisation(unit * missed[:, moving], unit[:, :, None] * jacobian[:, moving])
-
-        phi = self.coordinates.detach().double()
-        here = linearise(phi)
-        limit = self.max_steps if max_steps is None else max_steps
-        damping, steps = SINGULAR, 0
-        while steps < limit:
-            candidate = self._propose(phi, here, damping)
-            if (candidate - phi).abs().max() < 1e-10:
+        if weights is not None and weights.shape != (len(data),):
+            raise ValueError(f"weights must have shape ({len(data)},), one a transition, not {tuple(weights.shape)}")
+        newest = slice(max(0, len(data) - MAX_TRANSITIONS), None)
+        data, weights = data.take(newest), None if weights is None else weights[newest]
+        steps = self._steps(data)
+        left_out = float(len(data) - len(steps))
+        if not len(steps) or not len(self.names):
+            return {"steps": 0.0, "left_out": left_out}
+        values, taken = self.values.copy(), 0
+        problem = OneStep(self.simulation, self._scale, self._lower, self._upper, steps, weights)
+        for _ in range(self.max_steps if max_steps is None else max_steps):
+            moved = problem.step(values, self.max_step)
+            if moved is None:
                 break
-            there = linearise(candidate)
-            if there.loss <= here.loss:
-                phi, here, steps, damping = candidate, there, steps + 1, max(damping / 10, SINGULAR)
-            else:  # shorter until it improves; where nothing does, it soon is too short to go on
-                damping = max(10 * damping, 1e-3)
-        with th.no_grad():
-            self.coordinates.copy_(phi)
+            change = float(np.max(np.abs(moved - values) / self._scale))
+            values, taken = moved, taken + 1
+            if change < STILL:
+                break
+        self._values.copy_(th.as_tensor(values))
+        self._deviation.copy_(th.as_tensor(problem.deviation(values)))
+        self._name_unseen(problem.unseen)
+        return {"steps": float(taken), "left_out": left_out}
 
-        errors = self._standard_errors(phi, here).tolist()
-        log = {"loss": here.loss, "steps": float(steps), **self.describe()}
-        return log | {f"{name}_se": error for name, error in zip(self.declared, errors)}
-
-    def _propose(self, phi: th.Tensor, here: _Linearisation, damping: float) -> th.Tensor:
-        """The damped Gauss-Newton step from ``phi``, shortened to ``max_step`` and kept in bounds."""
-        gradient, hessian = here.gradient, here.hessian
-        # A constant that is pressed against its bound stays there; the others are solved for without it.
-        pressed = ((phi <= self._lower) & (gradient > 0)) | ((phi >= self._upper) & (gradient < 0))
-        free = (~pressed).nonzero()[:, 0]
-        curvature = hessian.diagonal()[free]
-        if not (curvature > 0).any():
-            return phi
-        ridge = th.diag(damping * curvature.max().expand(len(free)))
-        step = th.zeros_like(phi)
-        step[free] = -th.linalg.solve(hessian[free][:, free] + ridge, gradient[free])
-        step *= (self.max_step / step.abs().max().clamp(min=self.max_step)).item()
-        return (phi + step).clamp(self._lower, self._upper)
-
-    def _standard_errors(self, phi: th.Tensor, here: _Linearisation) -> th.Tensor:
-        """Standard errors of the declared constants, (p,), in their units.
-
-        The sandwich H^-1 (sum_i g_i g_i^T) H^-1 · n / (n - p), with H the Gauss-Newton Hessian and g_i the gradient of
-        transition i (White, 1980): RTO's weights are not precisions, and not every dimension is equally noisy, so the
-        plain sigma² H^-1 would be wrong. Far from the optimum it counts the misfit as noise.
-        """
-        n, p = len(here.residual), len(phi)
-        curvature, directions = th.linalg.eigh(here.hessian)
-        known = curvature > SINGULAR * curvature[-1].clamp(min=0)
-        if n <= p or not known.any():
-            return th.full_like(phi, math.inf)
-        inverse = (directions[:, known] / curvature[known]) @ directions[:, known].T
-        scores = th.einsum("ndp,nd->np", here.jacobian, here.residual)
-        covariance = inverse @ (scores.T @ scores) @ inverse * (n / (n - p))
-        unit = th.where(self._is_log, self.values(phi), self._width)
-        undetermined = (directions[:, ~known].abs() > 1e-3).any(dim=1)
-        return (covariance.diagonal().clamp(min=0).sqrt() * unit).masked_fill(undetermined, math.inf)
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """The random stream, and what the saved coordinates refer to."""
-        return super().get_extra_state() | self._reference()
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` returned.
-
-        :raises ValueError: if it was saved with other constants, declarations or bounds, where phi means another world
-        """
-        for key, mine in self._reference().items():
-            if state[key] != mine:
-                raise ValueError(f"saved with {key}={state[key]}, not {mine}; rebuild the model with the saved ones")
-        super().set_extra_state(state)
-
-    def _reference(self) -> dict[str, Any]:
-        return {"constants": self.nominal, "declared": self.declared, "bounds": self.bounds}
-
-
-def _complete(constants: Mapping[str, float]) -> dict[str, float]:
-    known = list(asdict(CartPoleParameters()))
-    for name in constants:
-        if name not in known:
-            raise ValueError(f"constants has unknown {name!r}{_suggestion(name, known)}")
-    return {name: float(value) for name, value in asdict(CartPoleParameters(**constants)).items()}
-
-
-def _checked_names(declared: Sequence[str]) -> list[str]:
-    if isinstance(declared, str) or not declared or len(set(declared)) < len(declared):
-        raise ValueError(
-            f"declared must be a list of one or more different names out of {list(DECLARABLE)}, not {declared!r}"
-        )
-    for name in declared:
-        if name not in DECLARABLE:
-            raise ValueError(f"declared has unknown constant {name!r}{_suggestion(name, list(DECLARABLE))}")
-    return list(declared)
-
-
-def _checked_bounds(
-    declared: list[str], nominal: dict[str, float], given: Mapping[str, tuple[float, float]]
-) -> dict[str, tuple[float, float]]:
-    for name in given:
-        if name not in declared:
-            raise ValueError(f"bounds has {name!r}, which is not declared{_suggestion(name, declared)}")
-    bounds = {}
-    for name in declared:
-        value = nominal[name]
-        lower, upper = map(float, given.get(name) or DECLARABLE[name] or (value / 10, value * 10))
-        for bound in (lower, upper):
-            CartPoleParameters(**{**nominal, name: bound})  # raises for bounds that no world can have
-        if not (lower < upper and lower <= value <= upper):
-            raise ValueError(
-                f"bounds of {name} must be (lower, upper) around its nominal value {value}, not ({lower}, {upper}); "
-                f"pass bounds={{{name!r}: (..., ...)}}"
+    def _name_unseen(self, unseen: np.ndarray) -> None:
+        """Warn once of parameters that the data do not show."""
+        names = tuple(self.names[i] for i in np.flatnonzero(unseen))
+        if set(names) - set(self._unseen):
+            warnings.warn(
+                f"the target's data do not show {', '.join(names)}: left at what it was; do not declare it, or move so "
+                "that it matters",
+                stacklevel=3,
             )
-        bounds[name] = (lower, upper)
-    return bounds
+        self._unseen = names
 
 
-def _checked_data(data: Transitions, weights: th.Tensor | None) -> tuple[Transitions, th.Tensor]:
-    """The newest transitions that count, and their weights summing to one."""
-    if weights is None:
-        weights = data.observations.new_ones(len(data))
-    if weights.shape != (len(data),):
-        raise ValueError(f"weights must have shape ({len(data)},), one a transition, not {tuple(weights.shape)}")
-    if not (weights >= 0).all() or not weights.isfinite().all() or not (weights > 0).any():
-        raise ValueError("weights must be finite, non-negative and not all zero (and data not empty)")
-    counted = weights.nonzero()[-MAX_TRANSITIONS:, 0]
-    data, weights = data.take(counted), weights[counted].double()
-    for name in ("observations", "actions", "next_observations"):
-        if not getattr(data, name).isfinite().all():
-            raise ValueError(f"data.{name} must be finite; drop such transitions or give them weight 0")
-    return data, weights / weights.sum()
-
-
-def _suggestion(name: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(str(name), known)
-    return f"; did you mean {' or '.join(near)}?" if near else f"; choose from {', '.join(known)}"
+def _name(effect: Effect, parameter: str) -> str:
+    return effect.label if isinstance(effect, Declared) else f"{effect.label}.{parameter}"

@@ -65,18 +65,36 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
     def __init__(self, env: gym.Env, effects: Sequence[Effect]) -> None:
         RecordConstructorArgs.__init__(self, effects=effects)
         gym.Wrapper.__init__(self, env)
-        base, seam = _steps(env)
-        self.effects = own(effects, base.model)
-        found = active(self.effects)
-        prepare(LiveWorld(base.model, base.data), found)
+        base, self._seam = _steps(env)
+        self._world = LiveWorld(base.model, base.data)
+        self.effects: list[Effect] = []
+        self._memory: list[dict[str, Any]] = []
+        self.set_effects(effects)
+
+    def set_effects(self, effects: Sequence[Effect]) -> None:
+        """Have these effects instead of the ones before; the simulation goes on from where it is.
+
+        :param effects: with their values, those of declared parameters too: what is not among them is nominal again
+        :raises ValueError: an effect on an object that is not in the model
+        """
+        base: Any = self.unwrapped
+        self._world.restore()
+        self._world.settle()
+        mine = own(effects, base.model)
+        labels, self.effects = [e.label for e in self.effects], mine
+        found = active(mine)
+        prepare(self._world, found)
         self._acting = [pair for pair in found if pair[0].overrides("act")]
         self._commanding = sorted((p for p in found if p[0].overrides("command")), key=lambda pair: pair[0].order)
         self._sensing = [pair for pair in found if pair[0].overrides("observe")]
-        self._memory: list[dict[str, Any]] = [{} for _ in self._commanding]
+        if labels != [e.label for e in mine] or len(self._memory) != len(self._commanding):
+            self._memory = [{} for _ in self._commanding]
+        for seam in (self._seam, "_get_obs"):
+            vars(base).pop(seam, None)
         self._hooks: dict[str, bool] = {}  # whether each was called yet
         if self._acting or self._commanding:
-            setattr(base, seam, self._simulate)
-            self._hooks[seam] = False
+            setattr(base, self._seam, self._simulate)
+            self._hooks[self._seam] = False
         if self._sensing:
             if not callable(getattr(base, "_get_obs", None)):
                 names = ", ".join(effect.label for effect, _ in self._sensing)
@@ -108,7 +126,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         base: Any = self.unwrapped
         model, data = base.model, base.data
         self._hooks.update(dict.fromkeys(self._hooks.keys() & set(_SEAMS), True))
-        world = LiveWorld(model, data)
+        world = LiveWorld(model, data)  # whose restore takes back the substeps' own changes alone
         for effect, _ in self._acting:
             if effect.place == "joint":
                 world.rough(effect.dof)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_rpto.dynamics.base import Transitions
-from sb3_rpto.dynamics.physical import DECLARABLE, MAX_TRANSITIONS, PhysicalDynamics, cartpole_constants
+from sb3_rpto.dynamics.cartpole import DECLARABLE, MAX_TRANSITIONS, CartPoleDynamics, cartpole_constants
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
 
 SOURCE = ContinuousCartPoleEnv()
@@ -34,11 +34,11 @@ def collect(n: int = 500, seed: int = 0, **constants: float) -> Transitions:
     return Transitions(*(th.as_tensor(np.array(column)) for column in zip(*rows)))
 
 
-def model(*declared: str, **kwargs) -> PhysicalDynamics:
+def model(*declared: str, **kwargs) -> CartPoleDynamics:
     kwargs.setdefault("constants", cartpole_constants(SOURCE))
     if declared:
         kwargs["declared"] = declared
-    return PhysicalDynamics(SOURCE.observation_space, SOURCE.action_space, **kwargs)
+    return CartPoleDynamics(SOURCE.observation_space, SOURCE.action_space, **kwargs)
 
 
 @pytest.mark.parametrize("length", [0.6, 1.2, 2.0, 4.0])
@@ -262,7 +262,7 @@ def test_checkpoint_round_trip():
     th.save(first.state_dict(), file)
     file.seek(0)
     state = th.load(file, weights_only=True)
-    second = PhysicalDynamics(
+    second = CartPoleDynamics(
         SOURCE.observation_space,
         SOURCE.action_space,
         constants=first.nominal,
@@ -313,7 +313,7 @@ def test_bad_arguments_are_named(kwargs, match):
 
 def test_other_spaces_are_refused():
     with pytest.raises(ValueError, match="cart-pole"):
-        PhysicalDynamics(spaces.Box(-1, 1, (3,)), SOURCE.action_space, constants={})
+        CartPoleDynamics(spaces.Box(-1, 1, (3,)), SOURCE.action_space, constants={})
 
 
 @pytest.mark.parametrize(

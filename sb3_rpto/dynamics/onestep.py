@@ -1,0 +1,212 @@
+"""One-step errors of a simulator on transitions, and trusted Gauss-Newton steps that lower them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import torch as th
+from scipy.optimize import lsq_linear
+
+from sb3_rpto.dynamics.base import Transitions
+from sb3_rpto.effects import Simulation
+from sb3_rpto.effects.simulation import Drive
+from sb3_rpto.envs.observations import StateMap
+
+#: Commands from before a transition, for delays and filters, in s.
+MEMORY = 0.2
+#: Finite differences, in the parameters' scales: wide ones see over the kinks of contacts, narrow ones see the slope.
+DIFFERENCES = (1e-2, 1e-3, 1e-4)
+#: Shares of the trusted size that a step may have.
+REACHES = 0.25 ** np.arange(5)
+#: A parameter that moves no residual by this share of the typical one, for a change by its scale, is not identified.
+UNSEEN = 1e-3
+#: Contacts make local optima: the loss turns linear at so many typical residuals, so that a missed touch-down is borne.
+CLIP = 3.0
+#: Residuals of what blows up, in standard one-step changes.
+BLOWN = 100.0
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Transitions as simulator steps; what no observation tells of a state is zero and not compared.
+
+    :param rows: which of the transitions: those whose states are known, (n,)
+    :param qpos: (n, nq)
+    :param qvel: (n, nv)
+    :param drive: the commands, some from before each step
+    :param reached: positions and velocities after the step, (n, nq + nv)
+    :param scale: standard change in one step of those, (nq + nv,); inf where nothing moves or is known
+    """
+
+    rows: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    drive: Drive
+    reached: np.ndarray
+    scale: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.qpos)
+
+    @property
+    def compared(self) -> np.ndarray:
+        """Which positions and velocities are compared, (nq + nv,)."""
+        return np.asarray(np.isfinite(self.scale))
+
+    def reach(self, simulation: Simulation, values: np.ndarray) -> np.ndarray:
+        """Where each of ``k`` phis leads, (k, n, nq + nv), from ``values`` (k, p)."""
+        k, n = len(values), len(self)
+        q, v = simulation.rollout(
+            np.repeat(values, n, axis=0),
+            np.tile(self.qpos, (k, 1)),
+            np.tile(self.qvel, (k, 1)),
+            self.drive.take(np.tile(np.arange(n), k)),
+        )
+        return np.concatenate([q[:, -1], v[:, -1]], axis=1).reshape(k, n, -1)
+
+
+def as_steps(data: Transitions, recover: StateMap, model: mujoco.MjModel, frame_skip: int) -> Steps:
+    """Transitions as simulator steps; those with an unknown state (a speed at the observation's bound) are left out.
+
+    :param data: oldest first; a transition that begins where the one before it ended follows it
+    :param recover: states from observations
+    :param model: the simulator's
+    :param frame_skip: simulation steps in one transition
+    """
+    arrays = (data.observations, data.next_observations, data.actions)
+    observations, next_observations, actions = (a.cpu().numpy().astype(np.float64) for a in arrays)
+    now, then = recover(observations), recover(next_observations)
+    known = np.concatenate([now.known_qpos & then.known_qpos, now.known_qvel & then.known_qvel], axis=1)
+    ever = np.asarray(known.any(axis=0))
+    rows = np.flatnonzero(known[:, ever].all(axis=1))
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = np.where(limited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf)).T
+    commands = np.clip(actions, low, high)
+    earlier = -(-round(MEMORY / float(model.opt.timestep)) // frame_skip)
+    drive = np.repeat(_history(observations, next_observations, commands, earlier)[rows], frame_skip, axis=1)
+    begun, reached = (np.nan_to_num(np.concatenate([s.qpos, s.qvel], axis=1))[rows] for s in (now, then))
+    spread = (reached - begun).std(axis=0) if len(rows) else np.zeros(len(ever))
+    qpos, qvel = np.split(begun, [model.nq], axis=1)
+    scale = np.where(ever & (spread > 1e-8), np.maximum(spread, 1e-8), np.inf)
+    return Steps(rows, qpos, qvel, Drive(drive, earlier * frame_skip), reached, scale)
+
+
+def _history(observations: np.ndarray, next_observations: np.ndarray, commands: np.ndarray, earlier: int) -> np.ndarray:
+    """The commands of each transition and of those before it in its episode, (n, earlier + 1, nu), oldest first.
+
+    Before an episode's first transition the first command is taken to have held.
+    """
+    follows = np.r_[False, (observations[1:] == next_observations[:-1]).all(axis=1)]
+    past = np.arange(len(commands))
+    history = [commands]
+    for _ in range(earlier):
+        past = np.where(follows[past], past - 1, past)
+        history.insert(0, commands[past])
+    return np.stack(history, axis=1)
+
+
+class OneStep:
+    """The robust weighted one-step error, as a function of phi.
+
+    :param simulation: whose parameters phi is
+    :param scale: of each parameter: its nominal value, or what is plausible, (p,)
+    :param lower: bounds, (p,)
+    :param upper: (p,)
+    :param steps: transitions
+    :param weights: of all transitions that the steps were chosen from; None: all alike
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        scale: np.ndarray,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        steps: Steps,
+        weights: th.Tensor | None,
+    ) -> None:
+        self.simulation, self.scale, self.lower, self.upper, self.steps = simulation, scale, lower, upper, steps
+        share = np.ones(len(steps)) if weights is None else weights.cpu().numpy().astype(float)[steps.rows]
+        self.share = share / share.sum()
+        self.clip = 1.0
+        #: parameters that the transitions did not show at the last step, (p,)
+        self.unseen = np.zeros(len(scale), dtype=bool)
+
+    def residuals(self, values: np.ndarray) -> np.ndarray:
+        """Errors of ``k`` phis (k, p) in standard one-step changes, (k, n, c)."""
+        steps = self.steps
+        off = (steps.reach(self.simulation, values) - steps.reached)[:, :, steps.compared] / steps.scale[steps.compared]
+        return np.clip(np.nan_to_num(off, nan=BLOWN), -BLOWN, BLOWN)
+
+    def cost(self, residuals: np.ndarray) -> np.ndarray:
+        """The weighted robust error, (k,), of residuals (k, n, c)."""
+        soft = 2 * self.clip**2 * (np.sqrt(1 + (residuals / self.clip) ** 2) - 1)
+        return np.einsum("knc,n->k", soft, self.share) / residuals.shape[2]
+
+    def linearise(self, values: np.ndarray, difference: float) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals at one phi (p,), (n, c), and their derivative by phi in scales, (n, c, p).
+
+        :param difference: of the parameters, in scales
+        """
+        change = difference * self.scale
+        change = np.where(values + change > self.upper, -change, change)
+        found = self.residuals(np.concatenate([values[None], values + np.diag(change)]))
+        slopes = (found[1:] - found[0]) * (self.scale / change)[:, None, None]
+        return found[0], slopes.transpose(1, 2, 0)
+
+    def step(self, values: np.ndarray, max_step: float) -> np.ndarray | None:
+        """A Gauss-Newton step that lowers the cost, within the bounds and a trusted size; None where there is none.
+
+        Steps from narrow and wide differences and of several sizes are simulated; the best is taken.
+
+        :param values: phi, (p,)
+        :param max_step: largest change of a parameter, in scales
+        """
+        self.unseen[:] = True
+        trials = [values]
+        for difference in DIFFERENCES:
+            residual, slopes = self.linearise(values, difference)
+            self.clip = _clip(residual)
+            trials += [self._within(values, residual, slopes, max_step * reach) for reach in REACHES]
+        costs = self.cost(self.residuals(np.stack(trials)))
+        best = int(np.argmin(costs))
+        return trials[best] if costs[best] < costs[0] else None
+
+    def _within(self, values: np.ndarray, residual: np.ndarray, slopes: np.ndarray, reach: float) -> np.ndarray:
+        """The weighted least-squares step in the bounds and within ``reach`` of each parameter, in scales."""
+        root = np.sqrt(self.robust(residual))
+        a, b = (root[:, :, None] * slopes).reshape(-1, len(values)), -(root * residual).reshape(-1)
+        size = np.sqrt((a**2).sum(axis=0))
+        shown = size >= UNSEEN * max(float(np.sqrt((b**2).sum())), 1e-6)
+        self.unseen &= ~shown
+        free = np.flatnonzero(shown)
+        moved = values.copy()
+        if len(free):
+            # Directions that the data hardly tell apart share a move.
+            a = np.concatenate([a[:, free], np.diag(1e-4 * size[free])])
+            b = np.concatenate([b, np.zeros(len(free))])
+            low, high = ((bound - values)[free] / self.scale[free] for bound in (self.lower, self.upper))
+            # The solver wants boxes with an inside.
+            box = np.minimum(np.maximum(low, -reach), -1e-12), np.maximum(np.minimum(high, reach), 1e-12)
+            moved[free] += lsq_linear(a, b, box, method="bvls").x * self.scale[free]
+        return np.clip(moved, self.lower, self.upper)
+
+    def robust(self, residual: np.ndarray) -> np.ndarray:
+        """Weights of the residuals (n, c) in the least squares that stand for the robust loss."""
+        return np.asarray(self.share[:, None] / np.sqrt(1 + (residual / self.clip) ** 2))
+
+    def deviation(self, values: np.ndarray) -> np.ndarray:
+        """Standard deviation of phi by the sandwich estimate, each transition an observation, (p,); 0 where unseen."""
+        residual, slopes = self.linearise(values, DIFFERENCES[1])
+        robust = self.robust(residual)
+        hessian = np.einsum("nc,ncp,ncq->pq", robust, slopes, slopes)
+        scores = np.einsum("nc,ncp,nc->np", robust, slopes, residual)
+        inverse = np.linalg.pinv(hessian, rcond=1e-10, hermitian=True)
+        spread = np.sqrt(np.maximum(np.diag(inverse @ (scores.T @ scores) @ inverse), 0.0)) * self.scale
+        return np.where(self.unseen, 0.0, spread)
+
+
+def _clip(residual: np.ndarray) -> float:
+    return CLIP * max(1e-6, 1.4826 * float(np.median(np.abs(residual))))
