@@ -10,7 +10,7 @@ import torch as th
 from scipy.optimize import lsq_linear
 
 from sb3_rpto.dynamics.base import Transitions
-from sb3_rpto.effects import Simulation
+from sb3_rpto.effects import Effect, Simulation
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.envs.observations import StateMap
 
@@ -56,51 +56,87 @@ class Steps:
         return np.asarray(np.isfinite(self.scale))
 
     def reach(self, simulation: Simulation, values: np.ndarray) -> np.ndarray:
-        """Where each of ``k`` phis leads, (k, n, nq + nv), from ``values`` (k, p)."""
+        """Where each of ``k`` phis leads, (k, n, nq + nv), from ``values`` (k, p), as its sensors show it."""
         k, n = len(values), len(self)
-        q, v = simulation.rollout(
-            np.repeat(values, n, axis=0),
-            np.tile(self.qpos, (k, 1)),
-            np.tile(self.qvel, (k, 1)),
-            self.drive.take(np.tile(np.arange(n), k)),
-        )
-        return np.concatenate([q[:, -1], v[:, -1]], axis=1).reshape(k, n, -1)
+        every = np.repeat(values, n, axis=0)
+        qpos, qvel = np.tile(self.qpos, (k, 1)), np.tile(self.qvel, (k, 1))
+        true_state(simulation, every, qpos, qvel)
+        q, v = simulation.rollout(every, qpos, qvel, self.drive.take(np.tile(np.arange(n), k)))
+        qpos, qvel = q[:, -1], v[:, -1]
+        for effect, x in _sensors(simulation, every):
+            qpos[:, effect.adr], qvel[:, effect.dof] = effect.observe(qpos[:, effect.adr], qvel[:, effect.dof], x)
+        return np.concatenate([qpos, qvel], axis=1).reshape(k, n, -1)
 
 
-def as_steps(data: Transitions, recover: StateMap, model: mujoco.MjModel, frame_skip: int) -> Steps:
+def true_state(simulation: Simulation, values: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
+    """Take back, in place, what the sensors make of the states.
+
+    :param simulation: whose effects on sensors count
+    :param values: (n, p)
+    :param qpos: as the sensors show it, (n, nq)
+    :param qvel: (n, nv)
+    """
+    for effect, x in _sensors(simulation, values):
+        qpos[:, effect.adr], qvel[:, effect.dof] = effect.unobserve(qpos[:, effect.adr], qvel[:, effect.dof], x)
+
+
+def _sensors(simulation: Simulation, values: np.ndarray) -> list[tuple[Effect, np.ndarray]]:
+    pairs = zip(simulation.effects, simulation.slices)
+    return [(effect, values[:, s]) for effect, s in pairs if effect.overrides("observe")]
+
+
+def as_steps(
+    data: Transitions, recover: StateMap, model: mujoco.MjModel, frame_skip: int, chosen: np.ndarray | None = None
+) -> Steps:
     """Transitions as simulator steps; those with an unknown state (a speed at the observation's bound) are left out.
 
     :param data: oldest first; a transition that begins where the one before it ended follows it
     :param recover: states from observations
     :param model: the simulator's
     :param frame_skip: simulation steps in one transition
+    :param chosen: ascending rows that become steps, of the others only the commands count; None: all
     """
+    earlier = -(-round(MEMORY / float(model.opt.timestep)) // frame_skip)
+    chosen = np.arange(len(data)) if chosen is None else chosen
+    skipped = max(0, int(chosen.min(initial=len(data))) - earlier)
+    data = data.take(slice(skipped, None))
     arrays = (data.observations, data.next_observations, data.actions)
     observations, next_observations, actions = (a.cpu().numpy().astype(np.float64) for a in arrays)
     now, then = recover(observations), recover(next_observations)
     known = np.concatenate([now.known_qpos & then.known_qpos, now.known_qvel & then.known_qvel], axis=1)
-    ever = np.asarray(known.any(axis=0))
-    rows = np.flatnonzero(known[:, ever].all(axis=1))
+    ever = known.any(axis=0) | _known_at_rest(recover)
+    rows = np.intersect1d(np.flatnonzero(known[:, ever].all(axis=1)), chosen - skipped)
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = np.where(limited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf)).T
     commands = np.clip(actions, low, high)
-    earlier = -(-round(MEMORY / float(model.opt.timestep)) // frame_skip)
-    drive = np.repeat(_history(observations, next_observations, commands, earlier)[rows], frame_skip, axis=1)
+    follows = np.r_[False, (observations[1:] == next_observations[:-1]).all(axis=1)]
+    drive = np.repeat(_history(commands, follows, rows, earlier), frame_skip, axis=1)
     begun, reached = (np.nan_to_num(np.concatenate([s.qpos, s.qvel], axis=1))[rows] for s in (now, then))
+    turned = list(now.wrapped)
+    # The simulator counts whole turns on from where it begins; an observed angle jumps by one.
+    reached[:, turned] -= 2 * np.pi * np.round((reached - begun)[:, turned] / (2 * np.pi))
     spread = (reached - begun).std(axis=0) if len(rows) else np.zeros(len(ever))
     qpos, qvel = np.split(begun, [model.nq], axis=1)
     scale = np.where(ever & (spread > 1e-8), np.maximum(spread, 1e-8), np.inf)
-    return Steps(rows, qpos, qvel, Drive(drive, earlier * frame_skip), reached, scale)
+    return Steps(rows + skipped, qpos, qvel, Drive(drive, earlier * frame_skip), reached, scale)
 
 
-def _history(observations: np.ndarray, next_observations: np.ndarray, commands: np.ndarray, earlier: int) -> np.ndarray:
-    """The commands of each transition and of those before it in its episode, (n, earlier + 1, nu), oldest first.
+def _known_at_rest(recover: StateMap) -> np.ndarray:
+    """Which positions and velocities an observation tells of while no speed is at its bound, (nq + nv,)."""
+    with np.errstate(all="ignore"):
+        rest = recover(np.zeros((1, recover.width)))
+    return np.concatenate([rest.known_qpos[0], rest.known_qvel[0]])
+
+
+def _history(commands: np.ndarray, follows: np.ndarray, rows: np.ndarray, earlier: int) -> np.ndarray:
+    """The commands of the transitions at ``rows`` and of those before, (len(rows), earlier + 1, nu), oldest first.
 
     Before an episode's first transition the first command is taken to have held.
+
+    :param commands: of all transitions, (n, nu)
+    :param follows: whether each begins where the one before it ended, (n,)
     """
-    follows = np.r_[False, (observations[1:] == next_observations[:-1]).all(axis=1)]
-    past = np.arange(len(commands))
-    history = [commands]
+    past, history = rows, [commands[rows]]
     for _ in range(earlier):
         past = np.where(follows[past], past - 1, past)
         history.insert(0, commands[past])

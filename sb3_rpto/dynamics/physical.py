@@ -11,14 +11,15 @@ import mujoco
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import ClipAction
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
-from sb3_rpto.dynamics.onestep import OneStep, Steps, as_steps
+from sb3_rpto.dynamics.onestep import OneStep, Steps, as_steps, true_state
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.effect import from_json
 from sb3_rpto.effects.wrapper import CorrectedEnv
-from sb3_rpto.envs.observations import StateMap, env_name, mujoco_model, single_env, state_map
+from sb3_rpto.envs.observations import StateMap, env_name, layers, mujoco_model, single_env, state_map
 from sb3_rpto.envs.state import copy_env
 
 #: Fits use the newest transitions: a few numbers are known long before.
@@ -41,6 +42,13 @@ def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
             f"{env_name(single)}: actions have shape {single.action_space.shape}, the model {model.nu} actuators; "
             "dynamics='physical' needs actions that are the commands of the actuators"
         )
+    for layer in layers(single)[:-1]:
+        # Clipping is what the actuators do themselves.
+        if isinstance(layer, gym.ActionWrapper) and not isinstance(layer, ClipAction):
+            raise ValueError(
+                f"{env_name(single)}: the wrapper {type(layer).__name__} changes actions, and dynamics='physical' "
+                "needs those that are the commands of the actuators; give it an environment without"
+            )
     frame_skip = getattr(single.unwrapped, "frame_skip", None)
     if frame_skip is None:
         raise ValueError(f"{env_name(single)} has no frame_skip; derive it from gymnasium.envs.mujoco.MujocoEnv")
@@ -52,7 +60,7 @@ class PhysicalDynamics(Dynamics):
 
     :meth:`fit` minimises the robust weighted one-step error
 
-    .. math:: \sum_i w_i \sum_j \rho(((f_\phi(s_i, a_i) - s'_i)_j / \sigma_j)
+    .. math:: \sum_i w_i \sum_j \rho((f_\phi(s_i, a_i) - s'_i)_j / \sigma_j)
 
     over positions and velocities (sigma: their standard one-step change; rho: soft-L1) by Gauss-Newton steps within the
     parameters' bounds and within a trusted size, so that the source moves smoothly towards the target; a step that
@@ -126,7 +134,8 @@ class PhysicalDynamics(Dynamics):
         self.names = [_name(e, p.name) for e in self.simulation.effects for p in e.parameters]
         self._lower, self._upper = (np.array([getattr(p, b) for p in parameters]) for b in ("lower", "upper"))
         values = self.simulation.values()
-        self._scale = np.maximum(np.abs(values), [p.size_for(scales) for p in parameters] if parameters else 0.0)
+        sizes = np.array([p.size_for(scales) for p in parameters])
+        self._scale = np.maximum(np.abs(self.simulation.null), sizes)
         device = self._values.device if "_values" in self._buffers else None
         self.register_buffer("_values", th.as_tensor(values, dtype=th.float64, device=device))
         self.register_buffer("_deviation", th.zeros(len(values), dtype=th.float64, device=device))
@@ -202,6 +211,7 @@ class PhysicalDynamics(Dynamics):
         twin.set_effects(self.effects())
         states = self.recover(observations.cpu().numpy())
         qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
+        true_state(self.simulation, np.tile(self.values, (len(qpos), 1)), qpos, qvel)
         following, rewards, ends = [], [], []
         for q, v, action in zip(qpos, qvel, actions.cpu().numpy()):
             twin.reset()
@@ -228,8 +238,8 @@ class PhysicalDynamics(Dynamics):
         before, predicted, after = (th.as_tensor(x[:, shown]) for x in (begun, reached, steps.reached))
         return relative_error(predicted, Transitions(before, before, before, after, before))
 
-    def _steps(self, data: Transitions) -> Steps:
-        return as_steps(data, self.recover, self.model, self.frame_skip)
+    def _steps(self, data: Transitions, chosen: np.ndarray | None = None) -> Steps:
+        return as_steps(data, self.recover, self.model, self.frame_skip, chosen)
 
     # ------------------------------------------------------------------ the fit
 
@@ -238,19 +248,20 @@ class PhysicalDynamics(Dynamics):
     ) -> dict[str, float]:
         """Move phi towards ``data`` by at most ``max_steps`` trusted steps; see the class.
 
-        :param data: transitions, of which the newest are fitted
-        :param weights: (n,), RTO's; None weighs all alike
+        :param data: transitions, of which the newest with a positive weight are fitted
+        :param weights: (n,), RTO's, not negative; None weighs all alike
         :param max_steps: default: that of the class
         :return: ``steps`` taken, and how many transitions were ``left_out`` (clipped or unknown states)
-        :raises ValueError: weights of another shape
+        :raises ValueError: weights of another shape, negative ones, or such that are not finite
         """
         if weights is not None and weights.shape != (len(data),):
             raise ValueError(f"weights must have shape ({len(data)},), one a transition, not {tuple(weights.shape)}")
-        newest = slice(max(0, len(data) - MAX_TRANSITIONS), None)
-        data, weights = data.take(newest), None if weights is None else weights[newest]
-        steps = self._steps(data)
-        left_out = float(len(data) - len(steps))
-        if not len(steps) or not len(self.names):
+        if weights is not None and not (weights.isfinite() & (weights >= 0)).all():
+            raise ValueError("weights must be finite and not negative")
+        counted = np.arange(len(data)) if weights is None else np.flatnonzero(weights.cpu().numpy())
+        steps = self._steps(data, counted[-MAX_TRANSITIONS:])
+        left_out = float(min(len(counted), MAX_TRANSITIONS) - len(steps))
+        if not steps.compared.any() or not len(self.names):
             return {"steps": 0.0, "left_out": left_out}
         values, taken = self.values.copy(), 0
         problem = OneStep(self.simulation, self._scale, self._lower, self._upper, steps, weights)

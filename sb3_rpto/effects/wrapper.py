@@ -68,27 +68,34 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         base, self._seam = _steps(env)
         self._world = LiveWorld(base.model, base.data)
         self.effects: list[Effect] = []
+        self._commanding: list[tuple[Effect, np.ndarray]] = []
         self._memory: list[dict[str, Any]] = []
         self.set_effects(effects)
 
     def set_effects(self, effects: Sequence[Effect]) -> None:
         """Have these effects instead of the ones before; the simulation goes on from where it is.
 
+        Delays and filters that act before and after remember their commands.
+
         :param effects: with their values, those of declared parameters too: what is not among them is nominal again
-        :raises ValueError: an effect on an object that is not in the model
+        :raises ValueError: an effect on an object that is not in the model, or on sensors that are read elsewhere than
+            in ``_get_obs``; nothing is changed then
         """
         base: Any = self.unwrapped
+        sensing = [effect.label for effect, _ in active(own(effects, base.model)) if effect.overrides("observe")]
+        if sensing and not callable(getattr(base, "_get_obs", None)):
+            raise ValueError(f"{', '.join(sensing)}: {type(base).__name__} has no _get_obs(); read its sensors there")
         self._world.restore()
         self._world.settle()
-        mine = own(effects, base.model)
-        labels, self.effects = [e.label for e in self.effects], mine
-        found = active(mine)
+        # Only now: the values that declared parameters start from are the model's own again.
+        self.effects = own(effects, base.model)
+        found = active(self.effects)
         prepare(self._world, found)
+        memories = {effect.label: memory for (effect, _), memory in zip(self._commanding, self._memory)}
         self._acting = [pair for pair in found if pair[0].overrides("act")]
         self._commanding = sorted((p for p in found if p[0].overrides("command")), key=lambda pair: pair[0].order)
         self._sensing = [pair for pair in found if pair[0].overrides("observe")]
-        if labels != [e.label for e in mine] or len(self._memory) != len(self._commanding):
-            self._memory = [{} for _ in self._commanding]
+        self._memory = [memories.get(effect.label, {}) for effect, _ in self._commanding]
         for seam in (self._seam, "_get_obs"):
             vars(base).pop(seam, None)
         self._hooks: dict[str, bool] = {}  # whether each was called yet
@@ -96,9 +103,6 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             setattr(base, self._seam, self._simulate)
             self._hooks[self._seam] = False
         if self._sensing:
-            if not callable(getattr(base, "_get_obs", None)):
-                names = ", ".join(effect.label for effect, _ in self._sensing)
-                raise ValueError(f"{names}: {type(base).__name__} has no _get_obs(); read its sensors there")
             base._get_obs = self._observe
             self._hooks["_get_obs"] = False
 

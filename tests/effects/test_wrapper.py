@@ -12,8 +12,12 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3 import SAC
 
 from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales, Simulation
+from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
+from sb3_rpto.effects.model import numbers
+from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.wrapper import CorrectedEnv, is_corrected
+from sb3_rpto.envs.state import copy_env
 
 POLE = "InvertedDoublePendulum-v5"
 #: other test modules may register effects of their own while all are collected
@@ -208,6 +212,167 @@ def test_observations_that_are_views_of_the_state_keep_what_the_sensor_shows():
     wrapped = CorrectedEnv(type_(), [Bias("hinge", b=0.25)])
     obs, _ = wrapped.reset(seed=0)
     assert obs[1] == wrapped.unwrapped.data.qpos[1] + 0.25
+
+
+# --- other effects afterwards -----------------------------------------------------------------------------------------
+
+
+def hopper_effects(model):
+    """By every hook, and numbers of every owner."""
+    changed = {"thigh.length": 0.5, "torso.mass": 5.0, "leg_joint.damping": 1.5, "foot_geom.friction": 1.2}
+    changed |= {"option.gravity": 8.0, "option.density": 30.0, "foot_joint.frictionloss": 2.0}
+    return [
+        *(Declared(model, name).with_values(np.array([value])) for name, value in changed.items()),
+        CoulombFriction("thigh_joint", level=3.0),
+        StribeckFriction("leg_joint", extra=2.0, level=1.0, speed=0.4),
+        Clock("rootx", a=20.0),
+        Double(object_names(model, "actuator")[2], g=0.3),
+        Lag(object_names(model, "actuator")[0], time=0.03),
+        Bias("rootz", b=0.02),
+    ]
+
+
+def cheetah_effects(model):
+    return [
+        Declared(model, "joint:bthigh.damping").with_values(np.array([9.0])),
+        Declared(model, "torso.mass").with_values(np.array([8.0])),
+        StribeckFriction("bshin", extra=2.0, level=1.0, speed=0.4),
+        Lag("ffoot", time=0.03),
+        Bias("bfoot", b=0.02),
+    ]
+
+
+TASKS = {"Hopper-v5": hopper_effects, "HalfCheetah-v5": cheetah_effects, POLE: effects}
+
+
+def fields(env):
+    return {name: value.copy() for name, value in numbers(env.unwrapped.model).items()}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_taking_all_effects_away_leaves_the_bare_environment(name):
+    bare, env = gym.make(name), gym.make(name)
+    env.reset(seed=0)
+    before, names = fields(env), set(vars(env.unwrapped))
+    wrapped = CorrectedEnv(env, TASKS[name](env.unwrapped.model))
+    actions = actions_for(bare, 40)
+    assert not np.array_equal(run(wrapped, actions)[-1][0], run(bare, actions)[-1][0])
+    wrapped.set_effects([])
+    assert wrapped.effects == []
+    np.testing.assert_equal(fields(env), before)
+    assert set(vars(env.unwrapped)) == names
+    assert_same(run(wrapped, actions), run(bare, actions))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_effects_set_later_are_those_set_at_first(name):
+    env, other = gym.make(name), gym.make(name)
+    chosen = TASKS[name](env.unwrapped.model)
+    wrapped, reference = CorrectedEnv(env, chosen[: len(chosen) // 2]), CorrectedEnv(other, chosen)
+    actions = actions_for(env, 25)
+    run(wrapped, actions_for(env, 7, seed=2), seed=5)
+    expected = run(reference, actions)
+    wrapped.set_effects(chosen)
+    assert_same(run(wrapped, actions), expected)
+    wrapped.set_effects([chosen[0].with_values(chosen[0].values * 1.1), *chosen[1:]])
+    wrapped.set_effects(chosen)  # values do not pile up
+    assert_same(run(wrapped, actions), expected)
+    assert_same(run(copy_env(wrapped), actions), expected)
+    assert_same(run(copy.deepcopy(wrapped), actions), expected)
+
+
+def test_a_declared_value_starts_from_the_models_own_again():
+    env = gym.make(POLE)
+    model = env.unwrapped.model
+    nominal, inertia, mass = float(model.body_mass[1]), model.body_inertia[1].copy(), Declared(model, "cart.mass")
+    wrapped = CorrectedEnv(env, [mass.with_values(np.array([7.0]))])
+    wrapped.set_effects([mass.with_values(np.array([3.0]))])
+    assert model.body_mass[1] == pytest.approx(3.0, rel=1e-15)
+    np.testing.assert_allclose(model.body_inertia[1], inertia * 3.0 / nominal, rtol=1e-12)
+    wrapped.set_effects([Declared(model, "hinge.damping")])
+    assert model.body_mass[1] == nominal
+
+
+def go_on(wrapped, reference, actions):
+    """Step both from the state of the first; the reference keeps its own model and memories."""
+    base, other = wrapped.unwrapped, reference.unwrapped
+    mujoco.mj_copyData(other.data, other.model, base.data)
+    for action in actions:
+        assert_same(wrapped.step(action), reference.step(action))
+
+
+def test_effects_change_in_the_middle_of_an_episode():
+    env, other = gym.make("Hopper-v5"), gym.make("Hopper-v5")
+    every = hopper_effects(env.unwrapped.model)
+    then = [Clock("rootz", a=9.0), Bias("rooty", b=0.1), Double(every[-3].on, g=0.1), *every[1:4]]
+    wrapped, reference = CorrectedEnv(env, [*every[::2], Lag(every[-3].on, time=0.03)]), CorrectedEnv(other, then)
+    actions = actions_for(env, 20)
+    run(wrapped, actions[:8])
+    state = env.unwrapped.state_vector()
+    wrapped.set_effects(then)
+    np.testing.assert_array_equal(env.unwrapped.state_vector(), state)
+    reference.reset(seed=1)
+    go_on(wrapped, reference, actions[8:])
+
+
+@pytest.mark.parametrize("delay", [0.03, 0.17])
+@pytest.mark.parametrize("more", [[], [Double("slide", g=0.4)]], ids=["alone", "beside another"])
+def test_commands_are_remembered_by_effects_that_stay(delay, more):
+    """As if the effects had been so from the start, and only the state were another."""
+    env, other = gym.make(POLE), gym.make(POLE)
+    later = [*more, CommandDelay("slide", delay=delay)]
+    wrapped, reference = CorrectedEnv(env, [CommandDelay("slide", delay=0.05)]), CorrectedEnv(other, later)
+    actions = actions_for(env, 9)
+    run(wrapped, actions[:4]), run(reference, actions[:4])
+    wrapped.set_effects(later)
+    go_on(wrapped, reference, actions[4:])
+
+
+def test_memories_go_with_their_effects():
+    """Of two that take turns, what one remembers is nothing to the other."""
+    env, other = gym.make(POLE), gym.make(POLE)
+    lag = [Lag("slide", time=0.02), CommandDelay("slide")]
+    delay = [Lag("slide"), CommandDelay("slide", delay=0.02)]
+    wrapped, reference = CorrectedEnv(env, lag), CorrectedEnv(other, delay)
+    actions = actions_for(env, 9)
+    run(wrapped, actions[:4])
+    wrapped.set_effects(delay)
+    reference.reset(seed=0)
+    go_on(wrapped, reference, actions[4:])
+
+
+def test_effects_that_cannot_be_change_nothing():
+    env = gym.make("Hopper-v5")
+    wrapped = CorrectedEnv(env, hopper_effects(env.unwrapped.model))
+    actions = actions_for(env, 15)
+    first, before = run(wrapped, actions), fields(env)
+    with pytest.raises(ValueError, match="no joint 'elbow'"):
+        wrapped.set_effects([CoulombFriction("thigh_joint", level=1.0), CoulombFriction("elbow", level=1.0)])
+    np.testing.assert_equal(fields(env), before)
+    assert_same(run(wrapped, actions), first)
+
+
+def test_sensors_that_are_read_elsewhere_are_refused():
+    base = type(gym.make(POLE).unwrapped)
+    env = type("Elsewhere", (base,), {"reset_model": lambda self: np.zeros(9), "_get_obs": None})()
+    wrapped = CorrectedEnv(env, [Declared(env.model, "cart.mass").with_values(np.array([7.0]))])
+    with pytest.raises(ValueError, match=r"test_bias\(hinge\): Elsewhere has no _get_obs"):
+        wrapped.set_effects([Bias("hinge", b=0.1)])
+    assert env.model.body_mass[1] == pytest.approx(7.0)
+
+
+def test_a_copy_has_effects_of_its_own():
+    env = gym.make(POLE)
+    wrapped = CorrectedEnv(env, effects(env.unwrapped.model))
+    actions = actions_for(env, 15)
+    first = run(wrapped, actions)
+    twin = copy_env(wrapped)
+    twin.set_effects([])
+    assert_same(run(wrapped, actions), first)
+    assert_same(run(twin, actions), run(gym.make(POLE), actions))
+
+
+# --- errors and the rest ----------------------------------------------------------------------------------------------
 
 
 def test_other_environments_are_refused():

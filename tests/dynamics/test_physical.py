@@ -1,0 +1,366 @@
+"""Simulators as trainable dynamics: what is fitted is what the target has, and step() is the environment's own."""
+
+import copy
+import io
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces, wrappers
+from shifted import HOPPER, POLE, POLES, SHIFTS, collect, joined, noisy, shifted
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_rpto.dynamics.physical import MAX_TRANSITIONS, PhysicalDynamics, physical_config
+from sb3_rpto.effects import Declared
+from sb3_rpto.effects.commands import CommandDelay, CommandGain
+from sb3_rpto.effects.friction import StribeckFriction
+from sb3_rpto.effects.sensors import SensorBias
+from sb3_rpto.envs.corrected import apply_effects
+
+
+def dynamics(env_id, declared=None, **kwargs):
+    env = gym.make(env_id)
+    declared = tuple(SHIFTS[env_id]) if declared is None else declared
+    return PhysicalDynamics(
+        env.observation_space, env.action_space, **physical_config(env), declared=declared, threads=1, **kwargs
+    )
+
+
+@pytest.fixture(scope="module")
+def poles():
+    return collect(shifted(POLES), 100)
+
+
+@pytest.fixture(scope="module")
+def pole():
+    return collect(shifted(POLE), 60)
+
+
+# --- what it is told of the environment -------------------------------------------------------------------------------
+
+
+def test_the_config_is_plain_data_of_its_own():
+    env = gym.make(HOPPER)
+    config = physical_config(VecNormalize(DummyVecEnv([lambda: env])))
+    env.unwrapped.model.body_mass[1] = 99.0
+    again = pickle.loads(pickle.dumps(config))
+    assert again["frame_skip"] == 4
+    assert again["model"].body_mass[1] == pytest.approx(gym.make(HOPPER).unwrapped.model.body_mass[1])
+    assert again["recover"](np.zeros((2, 11))).qpos.shape == (2, 6)
+
+
+class OneForAll(gym.ActionWrapper):
+    """The same command for every motor."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def action(self, action):
+        return np.repeat(action, 3)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: gym.make("Pendulum-v1"), "Pendulum-v1 has no MuJoCo model"),
+        (lambda: OneForAll(gym.make(HOPPER)), r"Hopper-v5: actions have shape \(1,\), the model 3 actuators"),
+        (lambda: wrappers.RescaleAction(gym.make(HOPPER), np.float32(-0.5), np.float32(0.5)), "RescaleAction changes"),
+        (lambda: wrappers.TransformObservation(gym.make(HOPPER), lambda o: o, None), "TransformObservation"),
+    ],
+)
+def test_environments_that_it_cannot_have_are_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        physical_config(make())
+
+
+def test_clipped_actions_are_commands():
+    assert physical_config(wrappers.ClipAction(gym.make(HOPPER)))["frame_skip"] == 4
+
+
+@pytest.mark.parametrize("name", ["max_step", "max_steps", "randomise"])
+@pytest.mark.parametrize("value", [-1, float("nan")])
+def test_settings_out_of_range_are_named(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be at least"):
+        dynamics(POLE, **{name: value})
+
+
+def test_unknown_names_raise_with_the_near_ones():
+    with pytest.raises(ValueError, match=r"no object 'thihg'; did you mean 'thigh'"):
+        dynamics(HOPPER, ["thihg.length"])
+    with pytest.raises(ValueError, match=r"has no 'lenght'; did you mean 'length'"):
+        dynamics(HOPPER, ["thigh.lenght"])
+    with pytest.raises(ValueError, match="no effect 'command_dely' is registered; did you mean 'command_delay'"):
+        dynamics(POLE, effects=[{"kind": "command_dely", "on": "slide", "values": {}}])
+    with pytest.raises(ValueError, match="no actuator 'slid'"):
+        dynamics(POLE, effects=[{"kind": "command_delay", "on": "slid", "values": {}}])
+
+
+def test_actions_of_another_size_are_refused():
+    env = gym.make(POLE)
+    with pytest.raises(ValueError, match=r"shape \(2,\), the model 1 actuators"):
+        PhysicalDynamics(env.observation_space, spaces.Box(-1, 1, (2,)), **physical_config(env))
+
+
+# --- the fit ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("env_id", "scale"), [(POLES, 0.3), (HOPPER, 1.0)])
+def test_a_fit_finds_what_was_shifted(env_id, scale):
+    data = collect(shifted(env_id), 100, scale=scale)
+    model = dynamics(env_id)
+    before = model.error(data)
+    log = model.fit(data, max_steps=30)
+    for name, value in SHIFTS[env_id].items():
+        assert model.describe()[name] == pytest.approx(value, rel=0.01)
+    assert log["left_out"] == 0
+    assert log["steps"] <= 30
+    assert model.error(data) < 1e-4 * before
+
+
+def test_the_source_moves_towards_the_target_step_by_step(poles):
+    model = dynamics(POLES, max_step=0.05)
+    nominal, errors = model.values, [model.error(poles)]
+    for _ in range(3):
+        before = model.values
+        assert model.fit(poles, max_steps=1)["steps"] == 1
+        assert np.abs((model.values - before) / nominal).max() <= 0.05 * (1 + 1e-9)
+        errors.append(model.error(poles))
+    assert errors == sorted(errors, reverse=True)
+    assert model.fit(poles, max_steps=0)["steps"] == 0
+
+
+def test_bounds_hold(poles):
+    model = dynamics(POLES, ["pole.length=0.55:0.65", "pole2.length", "hinge.damping"])
+    for _ in range(4):
+        model.fit(poles, max_steps=1)
+        assert 0.55 <= model.values[0] <= 0.65
+    assert model.values[0] == 0.65  # the truth lies beyond
+
+
+def test_transitions_of_no_weight_do_not_count(pole):
+    bad = copy.deepcopy(pole.take(slice(20, 35)))
+    bad.next_observations[:, 2:] += 5.0
+    mixed = joined(pole.take(slice(0, 20)), bad, pole.take(slice(35, None)))
+    weights = th.ones(60)
+    weights[20:35] = 0
+    right, wrong = dynamics(POLE, ["pole.mass"]), dynamics(POLE, ["pole.mass"])
+    right.fit(mixed, weights, max_steps=30)
+    wrong.fit(mixed, max_steps=30)
+    assert abs(wrong.values[0] - right.values[0]) > 1e-3
+    without = dynamics(POLE, ["pole.mass"])
+    without.fit(joined(pole.take(slice(0, 20)), pole.take(slice(35, None))), max_steps=30)
+    np.testing.assert_array_equal(right.values, without.values)
+    np.testing.assert_array_equal(right.deviation, without.deviation)
+
+
+def test_equal_weights_are_none(pole):
+    one, other = dynamics(POLE), dynamics(POLE)
+    one.fit(pole, th.full((60,), 0.5), max_steps=2)
+    other.fit(pole, max_steps=2)
+    np.testing.assert_allclose(one.values, other.values, rtol=1e-9)
+
+
+def test_bad_weights_are_refused(pole):
+    for weights, message in (
+        (th.ones(59), r"shape \(60,\).*not \(59,\)"),
+        (-th.ones(60), "not negative"),
+        (th.full((60,), th.nan), "finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            dynamics(POLE).fit(pole, weights)
+
+
+@pytest.mark.parametrize("case", ["empty", "one", "same", "no weight", "nothing declared"])
+def test_data_that_say_nothing_change_nothing(pole, case):
+    data = {"empty": pole.take(slice(0, 0)), "one": pole.take(slice(0, 1)), "same": pole.take(th.zeros(9).long())}
+    model = dynamics(POLE, [] if case == "nothing declared" else None)
+    before = model.values
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        log = model.fit(data.get(case, pole), th.zeros(60) if case == "no weight" else None)
+    assert log == {"steps": 0.0, "left_out": 0.0}
+    np.testing.assert_array_equal(model.values, before)
+    np.testing.assert_array_equal(model.deviation, 0)
+
+
+def test_speeds_at_the_bound_are_left_out_and_counted():
+    data = collect(shifted(HOPPER, {"leg.length": 0.55}), 60, scale=1.0)
+    wrong = copy.deepcopy(data)
+    wrong.observations[[5, 9], 5], wrong.next_observations[[20, 21], 8] = 10.0, -10.0
+    wrong.next_observations[5, :5] += 1.0
+    model = dynamics(HOPPER, ["leg.length"])
+    assert model.fit(wrong, max_steps=8)["left_out"] == 4
+    assert model.values[0] == pytest.approx(0.55, rel=1e-3)
+    wrong.observations[:, 5:] = 10.0
+    assert model.fit(wrong) == {"steps": 0.0, "left_out": 60.0}
+    assert np.isnan(model.error(wrong))
+
+
+def test_the_newest_transitions_are_fitted():
+    old = collect(gym.make(POLE), MAX_TRANSITIONS, seed=3, scale=0.05)
+    delayed = collect(shifted(POLE, {}, [CommandDelay("slide", delay=0.07)]), MAX_TRANSITIONS, seed=4, scale=0.1)
+    model = dynamics(POLE, [], effects=[CommandDelay("slide", delay=0.068).to_json()])
+    assert model.fit(joined(old, delayed), max_steps=4)["left_out"] == 0
+    assert model.values[0] == pytest.approx(0.07, abs=1e-6)
+
+
+def test_what_the_data_do_not_show_is_named_once_and_stays(pole):
+    model = dynamics(POLE, ["pole.mass", "cart.friction"])
+    nominal = model.values
+    with pytest.warns(UserWarning, match=r"do not show cart\.friction: left at") as caught:
+        model.fit(pole, max_steps=20)
+    assert caught[0].filename == __file__
+    assert model.values[1] == nominal[1]
+    assert model.deviation[1] == 0
+    assert model.deviation[0] > 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.fit(pole)
+
+
+def test_the_deviation_shrinks_with_the_data():
+    clean = collect(shifted(POLE), 240)
+    said = []
+    for n in (60, 240):
+        model = dynamics(POLE)
+        model.fit(noisy(clean.take(slice(0, n)), 1e-3), max_steps=20)
+        said.append(model.deviation)
+        truth = np.array(list(SHIFTS[POLE].values()))
+        np.testing.assert_array_less(np.abs(model.values - truth), 5 * model.deviation)
+    assert (said[1] > 0).all()
+    ratio = said[0] / said[1]  # 2 for independent transitions that tell the same
+    assert ((ratio > 1.3) & (ratio < 4)).all()
+    assert model.describe() == {
+        **dict(zip(SHIFTS[POLE], model.values)),
+        **{f"{name}_std": d for name, d in zip(SHIFTS[POLE], model.deviation)},
+    }
+
+
+# --- effects in phi ---------------------------------------------------------------------------------------------------
+
+
+def test_a_traced_delay_is_taken_in_and_fitted():
+    data = collect(shifted(POLES, {"pole.length": 0.7}, [CommandDelay("slide", delay=0.02)]), 80)
+    model = dynamics(POLES, ["pole.length"])
+    model.fit(data, max_steps=5)
+    without = model.error(data)
+    model.adopt([CommandDelay("slide", delay=0.013)])
+    assert model.names == ["pole.length", "command_delay(slide).delay"]
+    model.fit(data, max_steps=20)
+    np.testing.assert_allclose(model.values, [0.7, 0.02], rtol=0.01)
+    assert model.error(data) < 1e-2 * without
+
+
+def test_a_biased_sensor_is_fitted():
+    bias = SensorBias("hinge", offset=0.05)
+    data = collect(shifted(POLE, {"pole.mass": 7.0}, [bias]), 60)
+    model = dynamics(POLE, ["pole.mass"])
+    model.adopt([SensorBias("hinge", offset=0.01)])
+    model.fit(data, max_steps=80)
+    np.testing.assert_allclose(model.values, [7.0, 0.05], rtol=0.01)
+
+
+def test_adopt_keeps_the_values_of_what_it_is_not_told():
+    model = dynamics(POLE)
+    found = CommandDelay("slide", delay=0.03)
+    mass = model.effects()[0].with_values(np.array([6.0]))
+    model.adopt([found, mass])
+    assert model.describe()["pole.mass"] == 6.0
+    assert model.describe()["hinge.damping"] == 1.0
+    assert model.describe()["command_delay(slide).delay"] == 0.03
+    model.adopt([StribeckFriction("hinge", extra=0.2, level=0.1, speed=0.5), CommandDelay("slide", delay=0.01)])
+    np.testing.assert_array_equal(model.values, [6.0, 1.0, 0.01, 0.2, 0.1, 0.5])
+    assert [e.label for e in model.effects()] == [
+        *("pole.mass", "hinge.damping", "command_delay(slide)", "stribeck_friction(hinge)")
+    ]
+    np.testing.assert_array_equal(model.deviation, np.zeros(6))
+
+
+def test_what_was_added_and_the_state_rebuild_the_model(pole):
+    model = dynamics(POLE)
+    model.adopt([CommandGain("slide", change=0.1), model.effects()[0].with_values(np.array([6.0]))])
+    model.fit(pole, max_steps=2)
+    file = io.BytesIO()
+    th.save(model.state_dict(), file)
+    file.seek(0)
+    again = dynamics(POLE, effects=pickle.loads(pickle.dumps(model.added())))
+    again.load_state_dict(th.load(file, weights_only=False))
+    assert again.describe() == model.describe()
+    for each in (model, again):
+        each.fit(pole, max_steps=2)
+    assert again.describe() == model.describe()  # and learns on alike
+
+
+def test_effects_are_phi_or_drawn_around_it(pole):
+    model = dynamics(POLE, ["pole.mass=4.5:7.5", "hinge.damping"], randomise=2.0)
+    rng = np.random.default_rng(0)
+    assert [e.values[0] for e in model.effects(rng)] == model.values.tolist()  # before a fit nothing is uncertain
+    model.fit(noisy(pole, 0.02), max_steps=20)
+    drawn = np.array([[e.values[0] for e in model.effects(rng)] for _ in range(400)])
+    assert (drawn >= [4.5, 0]).all()
+    assert (drawn[:, 0] <= 7.5).all()
+    spread = 2 * model.deviation[1]
+    assert drawn[:, 1].std() == pytest.approx(spread, rel=0.2)
+    assert drawn[:, 1].mean() == pytest.approx(model.values[1], abs=spread / 4)
+    assert [e.values[0] for e in model.effects()] == model.values.tolist()
+    assert all(isinstance(e, Declared) for e in model.effects(rng))
+    model.randomise = 0.0
+    assert [e.values[0] for e in model.effects(rng)] == model.values.tolist()
+
+
+# --- prediction -------------------------------------------------------------------------------------------------------
+
+
+def test_the_error_is_in_standard_one_step_changes(poles):
+    model = dynamics(POLES)
+    steps = model._steps(poles)
+    off = (steps.reach(model.simulation, model.values[None])[0] - steps.reached) / steps.scale
+    assert model.error(poles) == pytest.approx(np.sqrt((off**2).mean()))
+    model.adopt([e.with_values(np.array([v])) for e, v in zip(model.effects(), SHIFTS[POLES].values())])
+    assert model.error(poles) < 1e-9
+
+
+def test_steps_need_the_environment():
+    with pytest.raises(RuntimeError, match="attach"):
+        dynamics(POLE).step(th.zeros(1, 4), th.zeros(1, 1))
+
+
+def test_an_environment_that_cannot_be_copied_is_refused():
+    env = gym.make(POLE)
+    env.unwrapped.lock = (n for n in ())
+    with pytest.raises(ValueError, match="cannot be copied"):
+        dynamics(POLE).attach(env)
+
+
+@pytest.mark.parametrize(("env_id", "sensor"), [(POLES, "hinge"), (HOPPER, "thigh_joint")])
+def test_a_step_is_the_corrected_environments_own(env_id, sensor):
+    source = gym.make(env_id)
+    model = dynamics(env_id)
+    model.attach(source)
+    model.step(th.zeros(1, source.observation_space.shape[0]), th.zeros(1, source.action_space.shape[0]))
+    model.adopt([e.with_values(np.array([v])) for e, v in zip(model.effects(), SHIFTS[env_id].values())])
+    model.adopt([StribeckFriction(sensor, extra=0.3, level=0.2, speed=0.4), SensorBias(sensor, offset=0.02)])
+    data = collect(apply_effects(source, model.effects()), 40, scale=1.0)
+    assert data.terminations.any()
+    said = model.step(data.observations, data.actions)
+    np.testing.assert_allclose(said.next_observations, data.next_observations, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(said.rewards, data.rewards, rtol=1e-5)
+    np.testing.assert_array_equal(said.terminations, data.terminations.bool())
+    assert said.next_observations.dtype == data.observations.dtype
+    np.testing.assert_array_equal(model.step(data.observations, data.actions).rewards, said.rewards)
+
+
+def test_steps_do_not_touch_the_environment_they_were_given():
+    env = gym.make(POLE)
+    env.reset(seed=0)
+    model = dynamics(POLE)
+    before = env.unwrapped.state_vector(), env.unwrapped.model.body_mass.copy()
+    model.attach(DummyVecEnv([lambda: env]))
+    model.adopt([model.effects()[0].with_values(np.array([6.0]))])
+    model.step(th.zeros(2, 4), th.ones(2, 1))
+    np.testing.assert_array_equal(env.unwrapped.state_vector(), before[0])
+    np.testing.assert_array_equal(env.unwrapped.model.body_mass, before[1])
