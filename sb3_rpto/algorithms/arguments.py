@@ -10,7 +10,7 @@ from typing import Any
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 
 from sb3_rpto.algorithms.bookkeeping import TwoWorlds
-from sb3_rpto.dynamics.factory import BACKENDS
+from sb3_rpto.dynamics.factory import BACKENDS, is_mujoco
 from sb3_rpto.dynamics.weights import WEIGHTINGS
 
 #: Arguments that only an algorithm with trainable dynamics has a use for.
@@ -20,6 +20,7 @@ DYNAMICS_ARGUMENTS = frozenset(
         "dynamics",
         "dynamics_kwargs",
         "declared",
+        "close_loop",
         "weighting",
         "weight_floor",
         "rollout_start",
@@ -30,12 +31,10 @@ DYNAMICS_ARGUMENTS = frozenset(
 UNSUPPORTED_BUFFERS = (DictReplayBuffer, NStepReplayBuffer)
 
 
-def check_supported(
-    n_steps: int, optimize_memory_usage: bool, replay_buffer_class: type[ReplayBuffer] | None, close_loop: bool
-) -> None:
-    """Refuse arguments of SAC's or ours that the algorithms are not written for.
+def check_supported(n_steps: int, optimize_memory_usage: bool, replay_buffer_class: type[ReplayBuffer] | None) -> None:
+    """Refuse arguments of SAC's that the algorithms are not written for.
 
-    :raises NotImplementedError: for n-step returns, overlapping storage, buffers of goals or Dicts, effect tracing
+    :raises NotImplementedError: for n-step returns, overlapping storage, buffers of goals or Dicts
     """
     if n_steps != 1 or optimize_memory_usage:
         raise NotImplementedError(
@@ -46,8 +45,6 @@ def check_supported(
             f"replay_buffer_class={replay_buffer_class.__name__} is not supported; leave it out or pass a subclass of "
             "ReplayBuffer for flat observations and single steps"
         )
-    if close_loop:
-        raise NotImplementedError("close_loop=True needs the effect tracer, which this version does not have yet")
 
 
 def check_one_target(target_env: Any, target_data: Any) -> None:
@@ -103,6 +100,24 @@ def check_values(
     for name, value in {**positive, "batch_size": batch_size, "buffer_size": buffer_size}.items():
         if not _is_integer(value) or value < 1:
             raise ValueError(f"{name} must be a positive integer, got {value!r}")
+
+
+def check_something_to_fit(config: dict[str, Any], close_loop: bool) -> None:
+    """Refuse a physical model without parameters, and a closed loop without a MuJoCo simulator.
+
+    :param config: of the dynamics
+    :raises ValueError: with the remedy
+    """
+    mujoco = config["backend"] == "physical" and is_mujoco(config)
+    if close_loop and not mujoco:
+        raise ValueError(
+            "close_loop=True traces what a MuJoCo simulator lacks: pass dynamics='physical' and a gymnasium MuJoCo env"
+        )
+    if mujoco and not close_loop and not config.get("declared") and not config.get("effects"):
+        raise ValueError(
+            "dynamics='physical' has nothing to fit: pass declared=[...], names of the model's numbers such as "
+            "'hinge.damping' or '*.mass', or close_loop=True"
+        )
 
 
 def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | None) -> None:

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Callable
 from typing import Any, Literal
 
+import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_rpto.algorithms.update import RelativeUpdate
 from sb3_rpto.algorithms.worlds import check_finite, share_normalisation
 from sb3_rpto.dynamics.base import Dynamics
+from sb3_rpto.dynamics.physical import PhysicalDynamics
+from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
+from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.state import copy_env, restore_state, save_state
 
 RolloutStart = Literal["target", "source", "mix"]
 
@@ -54,6 +60,10 @@ def make_source_world(
     """
     if dynamics is None:
         return EpisodeSource(env)
+    if isinstance(dynamics, PhysicalDynamics):
+        return SimulatorSource(dynamics, env, num_envs)
+    if isinstance(dynamics, ResidualDynamics):
+        dynamics.attach(env)
     if dynamics.rollout == "branches":
         return BranchSource(dynamics, rollout_start)
     return EpisodeSource(share_normalisation(DynamicsVecEnv(dynamics, env, num_envs), env))
@@ -108,6 +118,8 @@ class EpisodeSource(SourceWorld):
             timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
             scaled = model.policy.scale_action(actions)
             model.replay_buffer.append("source", raw_obs, raw_next, scaled, rewards, dones, timeouts)
+            for i in np.flatnonzero(dones):
+                self._episode_ended(int(i))
             for info in infos:
                 if "episode" in info:
                     self.returns.append(info["episode"]["r"])
@@ -115,6 +127,9 @@ class EpisodeSource(SourceWorld):
             self._last_obs = np.asarray(new_obs)
             steps += self.env.num_envs
         return steps
+
+    def _episode_ended(self, index: int) -> None:
+        """An environment has just begun a new episode."""
 
     def _raw(self, obs: Any) -> np.ndarray:
         """The observations that the environments just gave, not normalised; a copy."""
@@ -138,6 +153,70 @@ class EpisodeSource(SourceWorld):
             self.env.unwrapped.set_state(state["model"])  # type: ignore[attr-defined]
         for name in self._STATE:
             setattr(self, name, state[name])
+
+
+class SimulatorSource(EpisodeSource):
+    """Whole episodes of copies of the source with phi in it; rewards, terminations and resets are the source's own.
+
+    :param dynamics: whose phi the copies have, at every call the newest
+    :param env: the real source, of whose first environment copies are made
+    :param num_envs: how many
+    :raises ValueError: it cannot be copied
+    """
+
+    def __init__(self, dynamics: PhysicalDynamics, env: VecEnv, num_envs: int) -> None:
+        dynamics.attach(env)
+        self.dynamics = dynamics
+        self.copies = [CorrectedEnv(_copied(env), dynamics.effects()) for _ in range(num_envs)]
+        makers: list[Callable[[], gym.Env]] = [lambda copy=copy: copy for copy in self.copies]  # type: ignore[misc]
+        stacked = DummyVecEnv(makers)
+        # Copies of one environment would draw the same numbers.
+        stacked.seed(self._draw())
+        self._phi: tuple[Any, ...] = self._current()
+        self._rng = np.random.default_rng(self._draw())
+        super().__init__(share_normalisation(stacked, env))
+
+    def _draw(self) -> int:
+        return int(th.randint(2**31 - 1, (1,), generator=self.dynamics.generator))
+
+    def _current(self) -> tuple[Any, ...]:
+        return (*self.dynamics.names, *self.dynamics.values.tolist())
+
+    def interact(self, model: RelativeUpdate, n_steps: int, random: bool = False) -> int:
+        """As in :class:`EpisodeSource`; episodes under way go on where they are when phi has moved."""
+        if self._current() != self._phi:
+            self._phi = self._current()
+            for copy in self.copies:
+                copy.set_effects(self.dynamics.effects(self._rng))
+        return super().interact(model, n_steps, random)
+
+    def _episode_ended(self, index: int) -> None:
+        if self.dynamics.randomise > 0:
+            self.copies[index].set_effects(self.dynamics.effects(self._rng))
+
+    def get_state(self) -> dict[str, Any]:
+        """Where the episodes stand, the simulators included."""
+        phis = [[effect.values for effect in copy.effects] for copy in self.copies]
+        inner = {"simulators": save_state(self.env.unwrapped), "phis": phis, "phi": self._phi}
+        return {**super().get_state(), **inner, "rng": self._rng.bit_generator.state}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Continue where :meth:`get_state` was called; episodes begin anew where the simulators cannot be restored."""
+        for copy, values in zip(self.copies, state["phis"]):
+            copy.set_effects([e.with_values(v) for e, v in zip(self.dynamics.effects(), values)])
+        self._phi, self._rng.bit_generator.state = state["phi"], state["rng"]
+        if state["simulators"] is not None:
+            restore_state(self.env.unwrapped, state["simulators"])
+            super().set_state(state)
+
+
+def _copied(env: VecEnv) -> gym.Env:
+    copy = copy_env(env)
+    if copy is None:
+        raise ValueError(
+            f"env {env} cannot be copied, which dynamics='physical' needs; give it a DummyVecEnv of gym.make"
+        )
+    return copy
 
 
 class BranchSource(SourceWorld):

@@ -20,10 +20,12 @@ from stable_baselines3.sac.policies import SACPolicy
 from sb3_rpto.algorithms import arguments, checkpoint, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.checkpoint import Resumable
+from sb3_rpto.algorithms.closing import LoopCloser
 from sb3_rpto.algorithms.source import RolloutStart, make_source_world
 from sb3_rpto.algorithms.worlds import check_seedable, check_spaces, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics
+from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.weights import WeightingName
 from sb3_rpto.presets import resolve_preset
 
@@ -46,10 +48,13 @@ class TransferAlgorithm(Resumable):
     :param target_data: transitions of the target recorded beforehand (a replay buffer, its pickle or an ``.npz``),
         in place of ``target_env`` (RTO and RPTO)
     :param preset: hyperparameters for what is not passed: "default", "paper" or "author"
-    :param dynamics: backend of the trainable source, "ensemble" or "physical"
+    :param dynamics: backend of the trainable source: "ensemble" (networks), "physical" (a simulator with trainable
+        numbers) or "residual" (that simulator and a small ensemble on what it still misses)
     :param dynamics_kwargs: further arguments of the backend
     :param declared: names of the physical parameters to fit (physical backend)
-    :param close_loop: trace effects that nobody declared; not available yet
+    :param close_loop: trace on D_target what the simulator lacks beside the declared numbers, add it to phi and go on
+        (``dynamics="physical"`` on MuJoCo); a list looks for effects of these kinds alone. The reports are in
+        ``model.loop.reports``
     :param weighting: RTO's weight: "paper", "centred", "value_aware", or None (plain supervised learning)
     :param weight_floor: epsilon of the paper: the smallest weight, above 0 or equal to it
     :param real_ratio: share of target transitions in the critic's batches, in [0, 1); 0 in the paper
@@ -108,10 +113,10 @@ class TransferAlgorithm(Resumable):
         target_env: GymEnv | str | None = None,
         target_data: ReplayBuffer | str | pathlib.Path | None = None,
         preset: str = "default",
-        dynamics: Literal["ensemble", "physical"] = "ensemble",
+        dynamics: Literal["ensemble", "physical", "residual"] = "ensemble",
         dynamics_kwargs: dict[str, Any] | None = None,
         declared: Sequence[str] = (),
-        close_loop: bool = False,
+        close_loop: bool | Sequence[str] = False,
         weighting: WeightingName | None = "paper",
         weight_floor: float = 0.5,
         real_ratio: float = 0.05,
@@ -125,7 +130,7 @@ class TransferAlgorithm(Resumable):
             check_spaces(env.observation_space, env.action_space)
             check_seedable(env, "env")
         arguments.check_one_target(target_env, target_data)
-        arguments.check_supported(n_steps, optimize_memory_usage, replay_buffer_class, close_loop)
+        arguments.check_supported(n_steps, optimize_memory_usage, replay_buffer_class)
         super().__init__(
             policy,
             env,
@@ -160,6 +165,9 @@ class TransferAlgorithm(Resumable):
         self.dynamics_backend = dynamics
         self.dynamics_kwargs = dict(dynamics_kwargs or {})
         self.declared = tuple(declared)
+        self.close_loop = close_loop
+        #: traces what the simulator lacks, and holds the reports; None with the loop open
+        self.loop = None if not close_loop else LoopCloser(self.declared, None if close_loop is True else close_loop)
         self.weighting = weighting
         self.weight_floor = weight_floor
         self.real_ratio = real_ratio
@@ -195,6 +203,7 @@ class TransferAlgorithm(Resumable):
                 self.dynamics_config = dynamics_config(
                     self.dynamics_backend, self.env, self.dynamics_kwargs, self.declared
                 )
+                arguments.check_something_to_fit(self.dynamics_config, bool(self.close_loop))
             self._setup_model()
             if target_env is not None:
                 self.set_target_env(target_env)
@@ -206,7 +215,7 @@ class TransferAlgorithm(Resumable):
 
     def _apply_preset(self) -> None:
         """Set what the user did not pass; of ``dynamics_kwargs``, which both may give, the entries passed win."""
-        backend = self.dynamics_backend if self.updates_dynamics else "real"
+        backend = self._preset_section()
         spec = None if self.env is None else self.env.get_attr("spec", indices=[0])[0]
         env_id = spec.id if spec else None
         passed = self._passed - {"dynamics_kwargs"} - ({"source_steps"} if self.source_steps == "auto" else set())
@@ -214,6 +223,17 @@ class TransferAlgorithm(Resumable):
             if name == "dynamics_kwargs":
                 value = {**value, **self.dynamics_kwargs}
             setattr(self, name, value)
+
+    def _preset_section(self) -> str:
+        """The part of a preset that fits the source's kind."""
+        if not self.updates_dynamics:
+            return "real"
+        cheap = self.env is not None and self.env.has_attr("parameters")  # our cart-pole, whose fits cost nothing
+        return (
+            "mujoco"
+            if self.dynamics_backend == "physical" and self.env is not None and not cheap
+            else (self.dynamics_backend)
+        )
 
     def _check_arguments(self) -> None:
         arguments.check_applicable(type(self).__name__, self.updates_dynamics, self._passed)
@@ -368,6 +388,12 @@ class TransferAlgorithm(Resumable):
             self.store_step(callback.locals)  # SB3 drops the step after which a callback stops
         self._collected = rollout.episode_timesteps
         return rollout.continue_training
+
+    def _close_the_loop(self) -> None:
+        if self.loop is not None:
+            assert isinstance(self.dynamics, PhysicalDynamics)  # checked by the constructor
+            if self.loop.due(self, self.dynamics):
+                self.loop.close(self, self.dynamics)
 
     def dump_logs(self) -> None:
         """SB3's log plus what the source spent and earned."""

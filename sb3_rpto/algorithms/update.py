@@ -118,7 +118,10 @@ class RelativeUpdate(SAC):
                 self.weight_floor,
             )
             self.logger.record("rto/effective_samples", effective_sample_size(weights))
-        for name, value in {**self.dynamics.fit(data, weights), **self.dynamics.describe()}.items():
+        for name, value in self.dynamics.fit(data, weights).items():
+            self.logger.record(f"dynamics/{name}", value)
+        self._close_the_loop()
+        for name, value in self.dynamics.describe().items():
             self.logger.record(f"dynamics/{name}", value)
         self.logger.record("dynamics/error", self.dynamics.error(data))
         if self._offline:  # SB3 writes its logs at the end of target episodes; there are none
@@ -126,6 +129,9 @@ class RelativeUpdate(SAC):
 
     def _adopt_target_rules(self) -> None:
         """From the first fit on the model is one of the target: let what is known of the task be the target's."""
+
+    def _close_the_loop(self) -> None:
+        """After a fit: trace what the simulator lacks, where that was asked for and is due."""
 
     def sample_batches(self, batch_size: int) -> tuple[ReplayBufferSamples, ReplayBufferSamples]:
         """A batch for the critic, mostly of D_source, and one for the actor, alternating between the worlds.

@@ -11,15 +11,17 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
+from sb3_rpto.dynamics.physical import PhysicalDynamics, physical_config
+from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.envs.rules import task_rules
 
-BACKENDS = ("ensemble", "physical")
+BACKENDS = ("ensemble", "physical", "residual")
 
 
 def dynamics_config(backend: str, env: VecEnv, kwargs: dict[str, Any], declared: Sequence[str] = ()) -> dict[str, Any]:
     """Everything that rebuilds a model of ``env`` without ``env``: plain, picklable data.
 
-    :param backend: "ensemble" or "physical"
+    :param backend: "ensemble", "physical" or "residual"
     :param env: the source environment
     :param kwargs: the user's arguments of the backend; a ``reward_fn`` or ``termination_fn`` among them replaces what
         is known of the task
@@ -30,29 +32,49 @@ def dynamics_config(backend: str, env: VecEnv, kwargs: dict[str, Any], declared:
     if backend == "ensemble":
         if declared:
             raise ValueError("declared= names physical parameters; it needs dynamics='physical'")
-        rules = task_rules(env)
-        known = {"reward_fn": rules.reward_fn, "termination_fn": rules.termination_fn}
-        return {"backend": backend, **known, **kwargs}
+        return {"backend": backend, **_rules(env), **kwargs}
+    if backend in ("physical", "residual"):
+        config = {"backend": backend, **_simulator(env, backend)}
+        if backend == "residual":
+            config |= _rules(env)
+        return {**config, **kwargs, **({"declared": tuple(declared)} if declared else {})}
+    raise ValueError(f"dynamics={backend!r} does not exist; choose one of {list(BACKENDS)}")
+
+
+def _rules(env: VecEnv) -> dict[str, Any]:
+    """What is known of the task's rewards and terminations."""
+    rules = task_rules(env)
+    return {"reward_fn": rules.reward_fn, "termination_fn": rules.termination_fn}
+
+
+def _simulator(env: VecEnv, backend: str) -> dict[str, Any]:
+    """What a physical model must know of the source."""
     if backend == "physical":
         try:
-            constants = cartpole_constants(env)
-        except ValueError as error:
-            raise ValueError(
-                "dynamics='physical' simulates ContinuousCartPole alone in this version, env is another; "
-                "use dynamics='ensemble'"
-            ) from error
-        config = {"backend": backend, "constants": constants, **kwargs}
-        return {**config, "declared": tuple(declared)} if declared else config
-    raise ValueError(f"dynamics={backend!r} does not exist; choose one of {list(BACKENDS)}")
+            return {"constants": cartpole_constants(env)}
+        except ValueError:
+            pass
+    try:
+        return physical_config(env)
+    except ValueError as error:
+        raise ValueError(
+            f"dynamics={backend!r} needs a simulator whose numbers can be changed, which env is not: {error}; use "
+            "dynamics='ensemble'"
+        ) from error
+
+
+def is_mujoco(config: dict[str, Any]) -> bool:
+    """Whether a config is that of a MuJoCo simulator."""
+    return "model" in config
 
 
 def make_dynamics(config: dict[str, Any], observation_space: spaces.Box, action_space: spaces.Box) -> Dynamics:
     """Build the model that :func:`dynamics_config` described."""
     arguments = dict(config)
-    classes: dict[str, Any] = {"ensemble": EnsembleDynamics, "physical": CartPoleDynamics}
+    physical = PhysicalDynamics if is_mujoco(config) else CartPoleDynamics
+    classes: dict[str, Any] = {"ensemble": EnsembleDynamics, "residual": ResidualDynamics, "physical": physical}
+    made_by = classes[arguments.pop("backend")]
     try:
-        return classes[arguments.pop("backend")](observation_space, action_space, **arguments)
+        return made_by(observation_space, action_space, **arguments)
     except TypeError as error:
-        raise ValueError(
-            f"dynamics_kwargs: {error}; see {classes[config['backend']].__name__} for what there is"
-        ) from error
+        raise ValueError(f"dynamics_kwargs: {error}; see {made_by.__name__} for what there is") from error

@@ -18,6 +18,7 @@ from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_e
 from sb3_rpto.dynamics.onestep import OneStep, Steps, as_steps, true_state
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.effect import from_json
+from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.observations import StateMap, env_name, layers, mujoco_model, single_env, state_map
 from sb3_rpto.envs.state import copy_env
@@ -173,6 +174,31 @@ class PhysicalDynamics(Dynamics):
             old = mine.get(effect.label)
             mine[effect.label] = effect if old is None else old.with_values(effect.values)
         self._adopt(list(mine.values()))
+
+    def replace(self, effects: Sequence[Effect]) -> None:
+        """Let phi be exactly these effects with their values, as :meth:`effects` gave them."""
+        self._adopt(list(effects))
+
+    def runs(self, data: Transitions, first: np.ndarray, length: int) -> bool:
+        """Whether simulations from some of the target's states under its actions stay finite.
+
+        :param data: transitions, oldest first
+        :param first: rows to start from
+        :param length: transitions to run on for
+        """
+        states = self.recover(data.observations.cpu().numpy().astype(np.float64)[first])
+        actions = data.actions.cpu().numpy().astype(np.float64)
+        rows = np.minimum(first[:, None] + np.arange(length), len(actions) - 1)
+        commands = np.repeat(np.clip(actions[rows], *self._limits()), self.frame_skip, axis=1)
+        qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
+        q, v = self.simulation.rollout(np.tile(self.values, (len(first), 1)), qpos, qvel, Drive(commands))
+        return bool(np.isfinite(q).all() and np.isfinite(v).all())
+
+    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest commands, (nu,)."""
+        limited = self.model.actuator_ctrllimited.astype(bool)
+        low, high = np.where(limited[:, None], self.model.actuator_ctrlrange, (-np.inf, np.inf)).T
+        return low, high
 
     def added(self) -> list[dict[str, Any]]:
         """The effects beside the declared numbers, as ``effects=`` takes them."""

@@ -293,13 +293,28 @@ class Selector:
                     if self._simpler(other, best):
                         current, best = trial, other
             selection.alike[best] = sorted({e, *alike} - {best})
-        selection.model = current
+        selection.model = current = self._simplest(current, selection, screening)
         selection.alike = {
             e: [i for i in found if i not in current.effects]
             for e, found in selection.alike.items()
             if e in current.effects
         }
         return selection
+
+    def _simplest(self, model: Model, selection: Selection, screening: Screening) -> Model:
+        """Take the simpler ones of a class that do as well now that all else is right: richer ones win by trifles."""
+        for e in model.effects:
+            for other in sorted(screening.alike(e), key=lambda i: len(self.simulation.effects[i].parameters)):
+                if other in model.effects or not self._simpler(other, e):
+                    continue
+                self.say(f"{self.simulation.effects[other].label} is simpler")
+                begin = self._translated(model, e, other)
+                trial = self.model([i for i in model.effects if i != e] + [other], begin, REFIT + 3)
+                if not self.evidence(model, trial).clear(SEEMS):
+                    model = trial
+                    selection.alike[other] = sorted({*selection.alike.pop(e, []), e} - {other})
+                    break
+        return model
 
     def _alike_everywhere(self, model: Model, screening: Screening) -> Model:
         """Try each kept kind in the place of all others that it resembles, at once: one alone may look no better."""

@@ -40,7 +40,7 @@ def test_actions_that_are_not_flat_are_refused_at_construction(cls):
 
 def test_what_is_allowed_passes():
     arguments.check_values(**VALUES)
-    arguments.check_supported(1, False, None, False)
+    arguments.check_supported(1, False, None)
     arguments.check_applicable("RPO", False, {"env", "real_ratio"})
     arguments.check_applicable("RPTO", True, arguments.DYNAMICS_ARGUMENTS)
 
@@ -67,10 +67,9 @@ def test_a_wrong_value_is_named(name, value):
 @pytest.mark.parametrize(
     ("passed", "named"),
     [
-        ((3, False, None, False), "n_steps"),
-        ((1, True, None, False), "optimize_memory_usage"),
-        ((1, False, DictReplayBuffer, False), "replay_buffer_class=DictReplayBuffer"),
-        ((1, False, None, True), "close_loop"),
+        ((3, False, None), "n_steps"),
+        ((1, True, None), "optimize_memory_usage"),
+        ((1, False, DictReplayBuffer), "replay_buffer_class=DictReplayBuffer"),
     ],
 )
 def test_what_is_not_supported_is_named(passed, named):

@@ -1,0 +1,142 @@
+"""Close the loop inside ``learn()``: trace on D_target what the simulator lacks, and add it to phi."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_rpto.dynamics.base import Transitions
+from sb3_rpto.dynamics.physical import PhysicalDynamics
+from sb3_rpto.effects import Declared
+from sb3_rpto.envs.observations import single_env
+from sb3_rpto.tracing import Measurements, Report, trace
+
+if TYPE_CHECKING:
+    from sb3_rpto.algorithms.transfer import TransferAlgorithm
+
+#: Target transitions before the first trace, and new ones before another.
+FIRST, AGAIN = 200, 200
+#: Another trace is due when the one-step error of new transitions is so many times that after the last.
+RISEN = 2.0
+#: Samples in a window: several steps show what acts late, and contacts do not amplify errors yet.
+WINDOW = 4
+#: What is found is kept when the one-step error falls below this share of the best without it.
+WORTH = 0.9
+#: Source steps taken in the corrected simulator before learning goes on there.
+FRESH = 2_000
+#: A corrected simulator must stay finite for so many steps from states of the target, as the uncorrected one does.
+TRIAL_STATES, TRIAL_STEPS = 16, 20
+
+
+class LoopCloser:
+    """Decides when to trace, traces, and takes what is found into phi; it never spends a target step.
+
+    :param declared: names of the numbers that the user declared
+    :param kinds: of effects to look for; None: all
+    """
+
+    def __init__(self, declared: tuple[str, ...], kinds: Sequence[str] | None = None) -> None:
+        self.declared, self.kinds = declared, kinds
+        #: of this process; a checkpoint keeps what they said, :attr:`found`
+        self.reports: list[Report] = []
+        self.found: list[dict[str, Any]] = []
+        self._traced_at = 0
+        self._error = math.inf
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "reports": []}
+
+    def due(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
+        """Whether enough was seen for a first trace, or what is new is no longer predicted."""
+        size = model.replay_buffer.target.size()
+        if not self._traced_at:
+            return size >= FIRST
+        if size - self._traced_at < AGAIN:
+            return False
+        new = model.transitions("target").take(slice(self._traced_at, None))
+        return dynamics.error(new) > RISEN * self._error
+
+    def close(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:
+        """Trace on D_target, keep what lowers the error, log it, and renew D_source when phi has a new member."""
+        assert model.env is not None
+        data = model.transitions("target")
+        before = dynamics.error(data)
+        measured = Measurements.from_replay(model.replay_buffer, model.env)
+        env = single_env(model.env)
+        horizon = (WINDOW - 1) * float(env.unwrapped.dt)  # type: ignore[attr-defined]
+        report = trace(
+            env,
+            measured,
+            self.declared,
+            seed=model.seed or 0,
+            candidates=self.kinds,
+            horizon=horizon,
+            threads=dynamics.threads,
+        )
+        self.reports.append(report)
+        self.found.append(report.to_json())
+        self._traced_at = len(data)
+        added = self._take(model, dynamics, report, data, before)
+        self._error = dynamics.error(data)
+        logger = model.logger
+        logger.record("gap/residual_before", before)
+        logger.record("gap/residual_after", self._error)
+        logger.record("gap/adequacy_before", report.adequacy_before.ratio)
+        logger.record("gap/adequacy_after", report.adequacy_after.ratio)
+        logger.record("gap/verdict", report.verdict)
+        logger.record("gap/effects", ", ".join(added) or "none", exclude="tensorboard")
+        if model.verbose:
+            print(f"traced on {len(data)} target transitions: {report.verdict}; {', '.join(added) or 'nothing'} added")
+        if added:
+            renew_source(model)
+
+    def _take(
+        self,
+        model: TransferAlgorithm,
+        dynamics: PhysicalDynamics,
+        report: Report,
+        data: Transitions,
+        before: float,
+    ) -> list[str]:
+        """Let phi have the effects that were found, if that pays; the labels of those that are new."""
+        known = {effect.label for effect in dynamics.effects()}
+        found = [traced.effect for traced in (*report.declared, *report.effects)]
+        new = [effect.label for effect in found if effect.label not in known and not isinstance(effect, Declared)]
+        kept = dynamics.effects()
+        dynamics.adopt(found)
+        if not stays_finite(dynamics, data):
+            dynamics.replace(kept)
+            warnings.warn(
+                f"the simulator with {', '.join(new) or 'the traced values'} becomes unstable: refused, the last one "
+                "is kept; give bounds to what you declare",
+                stacklevel=4,
+            )
+            return []
+        after = dynamics.error(data)
+        if not after < (WORTH if new else 1.0) * before:
+            dynamics.replace(kept)
+            return []
+        assert model.dynamics_config is not None
+        model.dynamics_config["effects"] = dynamics.added()  # what a checkpoint rebuilds the model from
+        return new
+
+
+def stays_finite(dynamics: PhysicalDynamics, data: Transitions) -> bool:
+    """Whether the simulator runs on from states of the target under the target's own actions.
+
+    :param data: transitions of the target, oldest first
+    """
+    count = max(1, len(data) - TRIAL_STEPS)
+    first = np.unique(np.linspace(0, count - 1, TRIAL_STATES).astype(int))
+    return dynamics.runs(data, first, min(TRIAL_STEPS, len(data)))
+
+
+def renew_source(model: TransferAlgorithm) -> None:
+    """Drop what an uncorrected source produced, and act in the corrected one before learning goes on."""
+    assert model._source_world is not None
+    model.replay_buffer.source.reset()
+    model.source_timesteps += model._source_world.interact(model, min(FRESH, model.replay_buffer.source.buffer_size))

@@ -1,0 +1,203 @@
+"""The loop closed inside learn(): what the target has and nobody declared joins phi."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_rpto import RPTO
+from sb3_rpto.algorithms import closing
+from sb3_rpto.algorithms.closing import LoopCloser, stays_finite
+from sb3_rpto.dynamics.physical import PhysicalDynamics
+from sb3_rpto.effects import LIBRARY, Effect, declare
+from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.tracing import Report
+
+TASK = "InvertedDoublePendulum-v5"
+KINDS = ["coulomb_friction", "torque_offset", "quadratic_drag"]
+LEVEL, LENGTH = 3.0, 1.15
+
+
+def target(lacks: list[Effect]) -> gym.Env:
+    env = gym.make(TASK)
+    declared = [d.with_values(LENGTH * d.values) for d in declare(env.unwrapped.model, ["pole.length"])]  # type: ignore[attr-defined]
+    return apply_effects(env, [*declared, *lacks])
+
+
+def friction() -> list[Effect]:
+    return [LIBRARY["coulomb_friction"]("slider", level=LEVEL)]
+
+
+def model(lacks: list[Effect], **kwargs: object) -> RPTO:
+    settings: dict[str, object] = {
+        **{"dynamics": "physical", "declared": ["pole.length"], "close_loop": KINDS, "seed": 0, "device": "cpu"},
+        **{"source_steps": 4, "gradient_steps": 1, "weighting": None, "model_train_freq": 40, "batch_size": 32},
+        **kwargs,
+    }
+    return RPTO("MlpPolicy", gym.make(TASK), target_env=target(lacks), **settings)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(closing, "FIRST", 80)
+    monkeypatch.setattr(closing, "FRESH", 50)
+
+
+@cache
+def learned() -> RPTO:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(closing, "FIRST", 80)
+        patch.setattr(closing, "FRESH", 50)
+        return model(friction()).learn(100, source_timesteps=100)
+
+
+def dynamics(made: RPTO) -> PhysicalDynamics:
+    assert isinstance(made.dynamics, PhysicalDynamics)
+    return made.dynamics
+
+
+def test_an_undeclared_effect_is_named_added_and_fitted() -> None:
+    made = learned()
+    assert made.loop is not None
+    report: Report = made.loop.reports[0]
+    assert report.verdict == "explained"
+    assert [traced.effect.label for traced in report.effects] == ["coulomb_friction(slider)"]
+    values = dynamics(made).describe()
+    assert values["coulomb_friction(slider).level"] == pytest.approx(LEVEL, rel=0.01)
+    assert values["pole.length"] == pytest.approx(LENGTH * 0.6, rel=0.01)
+
+
+def test_no_target_step_is_spent_on_tracing() -> None:
+    made = learned()
+    assert made.num_timesteps == 100
+    assert made.target_spent == {"learning": 100}
+
+
+def test_what_an_uncorrected_source_produced_is_dropped() -> None:
+    made = learned()
+    # Since the trace at step 80 alone: the fresh steps, then four for each target step.
+    assert made.replay_buffer.source.size() < 50 + 4 + 4 * 21
+
+
+def test_source_episodes_have_the_effect() -> None:
+    made = learned()
+    copy = made._source_world.copies[0]  # type: ignore[union-attr]
+    assert "coulomb_friction(slider)" in [effect.label for effect in copy.effects]
+
+
+def test_the_corrected_simulator_comes_back_from_a_checkpoint(tmp_path: Path) -> None:
+    made = learned()
+    made.save(tmp_path / "model")
+    loaded = RPTO.load(tmp_path / "model", device="cpu")
+    assert dynamics(loaded).describe() == dynamics(made).describe()
+    assert loaded.loop is not None
+    assert loaded.loop.found[0]["verdict"] == "explained"
+
+
+def test_a_learned_model_predicts_the_target() -> None:
+    made = learned()
+    assert dynamics(made).error(made.transitions("target")) < 1e-3
+
+
+def filled(lacks: list[Effect], count: int = 100) -> RPTO:
+    """A model whose D_target holds random actions in the target, ready to close the loop."""
+    made = model(lacks)
+    made.learn(1, source_timesteps=0)
+    append(made, lacks, count)
+    return made
+
+
+def append(made: RPTO, lacks: list[Effect], count: int) -> None:
+    """Let D_target hold random actions in a target with these effects."""
+    env = target(lacks)
+    rng = np.random.default_rng(0)
+    observation, _ = env.reset(seed=0)
+    for _ in range(count):
+        action = rng.uniform(-1, 1, 1).astype(np.float32)
+        following, reward, terminated, _, _ = env.step(action)
+        made.replay_buffer.add(
+            observation[None], following[None], action[None], np.array([reward]), np.array([terminated]), [{}]
+        )
+        observation = env.reset()[0] if terminated else following
+
+
+def test_nothing_is_added_where_nothing_is_missing(soon: None) -> None:
+    made = filled([])
+    dynamics(made).fit(made.transitions("target"), max_steps=30)
+    assert made.loop is not None
+    made.loop.close(made, dynamics(made))
+    assert made.loop.reports[0].verdict == "complete"
+    assert dynamics(made).names == ["pole.length"]
+
+
+def test_an_unstable_correction_is_refused(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = filled(friction())
+    before = dynamics(made).describe()
+    monkeypatch.setattr(closing, "stays_finite", lambda *_: False)
+    assert made.loop is not None
+    with pytest.warns(UserWarning, match=r"coulomb_friction\(slider\).*unstable: refused"):
+        made.loop.close(made, dynamics(made))
+    assert dynamics(made).describe() == before
+
+
+def test_instability_is_seen() -> None:
+    made = filled([], 30)
+    data = made.transitions("target")
+    assert stays_finite(dynamics(made), data)
+    spring = LIBRARY["spring"]("hinge", stiffness=1e9)
+    dynamics(made).adopt([spring])
+    assert not stays_finite(dynamics(made), data)
+
+
+def test_another_trace_is_due_when_new_transitions_are_no_longer_predicted(
+    soon: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(closing, "AGAIN", 20)
+    made = filled(friction())
+    loop = made.loop
+    assert isinstance(loop, LoopCloser)
+    assert loop.due(made, dynamics(made))
+    loop.close(made, dynamics(made))
+    assert not loop.due(made, dynamics(made))
+    append(made, friction(), 30)
+    assert not loop.due(made, dynamics(made))
+    append(made, [LIBRARY["torque_offset"]("hinge", offset=2.0)], 30)
+    assert loop.due(made, dynamics(made))
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"dynamics": "ensemble", "declared": ()}, "close_loop=True traces what a MuJoCo simulator lacks"),
+        ({"close_loop": False, "declared": ()}, "nothing to fit"),
+        ({"declared": ["pole.lenght"]}, "has no 'lenght'; did you mean 'length'"),
+    ],
+)
+def test_what_cannot_be_closed_is_refused(settings: dict[str, object], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        model([], **settings)
+
+
+def test_rpo_has_no_loop_to_close() -> None:
+    from sb3_rpto import RPO
+
+    with pytest.raises(ValueError, match="close_loop"):
+        RPO("MlpPolicy", gym.make(TASK), target_env=target([]), close_loop=True)
+
+
+def test_weights_of_the_target_reach_the_fit() -> None:
+    made = filled([], 40)
+    data = made.transitions("target")
+    weights = th.zeros(len(data))
+    weights[:20] = 1.0
+    first = dynamics(made).fit(data.take(slice(0, 20)), max_steps=3)
+    values = dynamics(made).values.copy()
+    again = model([])
+    second = dynamics(again).fit(data, weights, max_steps=3)
+    assert first["steps"] == second["steps"]
+    np.testing.assert_allclose(dynamics(again).values, values, rtol=0.05)
