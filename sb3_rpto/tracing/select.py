@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -29,6 +30,8 @@ FOLDS = 6
 SEEMS = 1.5
 #: Rounds of the look forward, and candidates fitted in each.
 ROUNDS, PROMISING = 3, 4
+#: Pairs of kept effects in whose place one is tried.
+MERGES = 3
 #: Typical window error, in units of the noise, that leaves nothing to look forward to.
 ENOUGH = 1.1
 #: Candidates for a substitution are the likest so many, of at least this cosine.
@@ -114,11 +117,13 @@ class Selection:
 
 
 class Selector:
-    """Fits and compares models on training and select windows.
+    """Fits models to training windows and compares them on windows that they were not fitted to.
+
+    Those are the select windows, and the training windows by cross-validation: they are parted into folds of blocks,
+    each judged by a fit to the others.
 
     :param train: windows to fit
-    :param select: windows to judge on; None where no runs are set apart: then the training windows are parted into
-        folds of blocks, each judged by a fit to the others
+    :param select: windows of runs set apart; None where there are none
     :param threshold: t*, see :func:`sb3_rpto.tracing.trace.trace`
     :param say: progress
     :param horizon: length of the windows in s, for the gap between folds
@@ -129,10 +134,10 @@ class Selector:
     ) -> None:
         self.train, self.select, self.threshold, self.say = train, select, threshold, say
         self.horizon = horizon
-        self.folds = [] if select else folds(train.windows, FOLDS, horizon)
-        self.blocks = (
-            select.windows.block if select else np.concatenate([train.windows.block[b] for _, b in self.folds])
-        )
+        self.folds = folds(train.windows, FOLDS, horizon)
+        self.blocks = np.concatenate([train.windows.block[b] for _, b in self.folds])
+        if select:
+            self.blocks = np.concatenate([self.blocks, select.windows.block + self.blocks.max() + 1])
         self.simulation = train.simulation
         self._memory: dict[tuple[int, ...], Model] = {}
 
@@ -215,11 +220,9 @@ class Selector:
     def _errors(self, fit: Fit, effects: Sequence[int]) -> np.ndarray:
         """Errors on windows that the parameters were not fitted to.
 
-        Without select windows each fold's parameters are one Gauss-Newton step away from the fit to all, taken with
-        the windows of the fold and beside it left out.
+        Each fold's parameters are one Gauss-Newton step away from the fit to all training windows, taken with the
+        windows of the fold and beside it left out.
         """
-        if self.select:
-            return self.select.score(fit.values).errors
         train, free = self.train, self.free(effects)
         rows = np.tile(fit.values, (len(train.windows), 1))
         if len(free):
@@ -231,10 +234,11 @@ class Selector:
                 move = bounded_step(normal, gradient, low, high) * train.size[free]
                 rows[np.ix_(judged, free)] += move
         errors = train.score(rows).errors
-        return np.concatenate([errors[judged] for _, judged in self.folds])
+        unseen = [errors[judged] for _, judged in self.folds]
+        return np.concatenate([*unseen, self.select.score(fit.values).errors] if self.select else unseen)
 
     def evidence(self, with_: Model, without: Model) -> Evidence:
-        """What ``with_`` gains over ``without`` on the select windows."""
+        """What ``with_`` gains over ``without`` on windows that neither was fitted to."""
         return compare(without.errors, with_.errors, self.blocks)
 
     def eliminate(self, outcome: Selection, limit: float) -> Selection:
@@ -299,6 +303,27 @@ class Selector:
             for e, found in selection.alike.items()
             if e in current.effects
         }
+        return selection
+
+    def merge(self, selection: Selection, screening: Screening) -> Selection:
+        """Try one effect in the place of two: the joint fit may have met its like by a mixture."""
+        current = selection.model
+        pairs = sorted(combinations(current.effects, 2), key=lambda pair: -screening.cosine[pair])[:MERGES]
+        for pair in pairs:
+            rest = [e for e in current.effects if e not in pair]
+            if len(rest) != len(current.effects) - 2:
+                continue
+            without = self.model(rest, current.fit)
+            outside = [i for i in range(len(self.simulation.effects)) if i not in rest and screening.excited(i)]
+            outside = [i for i in outside if self.simulation.effects[i].kind != "declared"]
+            for one in self._promising(without, outside):
+                self.say(f"{self.simulation.effects[one].label} in the place of two")
+                trial = self.model([*rest, one], without.fit, REFIT + 3)
+                if not self.evidence(current, trial).clear(SEEMS):
+                    current = trial
+                    selection.alike[one] = [i for i in screening.alike(one) if i not in trial.effects]
+                    break
+        selection.model = current
         return selection
 
     def _simplest(self, model: Model, selection: Selection, screening: Screening) -> Model:

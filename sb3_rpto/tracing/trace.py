@@ -214,7 +214,7 @@ def search(selector: Selector, rough: Selector, base: Model, screening: Screenin
     selection = rough.add_back(selection, chosen)
     selection = rough.eliminate(selection, rough.threshold)
     say(0.7, "trying like effects in their place")
-    selection = rough.substitute(selection, screening)
+    selection = rough.merge(rough.substitute(selection, screening), screening)
     selection.model = selector.model(selection.model.effects, selection.model.fit, iterations=10)
     return selector.judge(selection)
 
