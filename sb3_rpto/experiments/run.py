@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pathlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import gymnasium as gym
@@ -34,7 +34,7 @@ class LearningCurve(BaseCallback):
     """Evaluates the deterministic policy every so many target steps, in an environment of its own.
 
     :param make_target: makes an evaluation environment
-    :param every: target steps between evaluations
+    :param every: target steps between evaluations, or the steps at which they are made
     :param n_episodes: episodes of an evaluation
     :param seed: of the evaluation's initial states
     :param read: further values of a row, read off the model (an estimated parameter, say)
@@ -43,16 +43,16 @@ class LearningCurve(BaseCallback):
     def __init__(
         self,
         make_target: MakeEnv,
-        every: int,
+        every: int | Collection[int],
         n_episodes: int = 10,
         seed: int = 0,
-        read: Callable[[Any], dict[str, float]] | None = None,
+        read: Callable[[Any], dict[str, Any]] | None = None,
     ) -> None:
         super().__init__()
         self.env = make_vec_env(make_target, n_envs=n_episodes)
         self.every, self.n_episodes, self.seed = every, n_episodes, seed
         self.read = read
-        self.rows: list[dict[str, float]] = []
+        self.rows: list[dict[str, Any]] = []
         self._spent = 0.0  # seconds of training, without the evaluations
         self._since = 0.0
 
@@ -73,7 +73,8 @@ class LearningCurve(BaseCallback):
         self._since = time.perf_counter()
 
     def _on_step(self) -> bool:
-        if self.num_timesteps % self.every == 0:
+        steps, every = self.num_timesteps, self.every
+        if steps % every == 0 if isinstance(every, int) else steps in every:
             self._spent += time.perf_counter() - self._since
             self.evaluate(self.model, self.num_timesteps)  # type: ignore[arg-type]
             self._since = time.perf_counter()
@@ -87,12 +88,12 @@ def transfer(
     make_target: MakeEnv,
     budget: int,
     *,
-    every: int,
+    every: int | Collection[int],
     seed: int = 0,
     n_episodes: int = 10,
     n_source_envs: int = 1,
     source_data: str | None = None,
-    read: Callable[[Any], dict[str, float]] | None = None,
+    read: Callable[[Any], dict[str, Any]] | None = None,
     **kwargs: Any,
 ) -> list[dict[str, Any]]:
     """Run one method once.
@@ -102,7 +103,7 @@ def transfer(
     :param make_source: makes the source environment
     :param make_target: makes the target
     :param budget: target steps
-    :param every: target steps between evaluations
+    :param every: target steps between evaluations, or the steps at which they are made
     :param seed: of the run
     :param n_episodes: episodes of an evaluation
     :param n_source_envs: source environments that step side by side

@@ -1,0 +1,305 @@
+"""What closing the loop is worth: policies moved to shifted targets, with and without effects that nobody declared."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cache, partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import torch as th
+from stable_baselines3 import SAC
+
+from sb3_rpto.buffers import load_transitions
+from sb3_rpto.effects import LIBRARY, Declared, Effect, declare
+from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.experiments.report import iqm_interval
+from sb3_rpto.experiments.run import transfer
+from sb3_rpto.tracing.report import write_atomically
+
+#: Where trained source agents are looked for: ``<task>.zip`` and ``<task>_transitions.npz``.
+FOLDER_VARIABLE = "RPTO_SOURCES"
+SHIFTS = ("declared", "undeclared", "none")
+#: Two fixed targets for each task and shift.
+TARGETS = (0, 1)
+EPISODES = 10
+
+
+@dataclass(frozen=True)
+class Task:
+    """A source, what its user declares, and what its user does not know.
+
+    :param env_id: of gymnasium
+    :param declared: names of numbers that are shifted by up to 20 % and declared
+    :param lacks: kind of effect, value as a share of its place's peak (or in its units), and objects it sits on
+    :param source_steps: of SAC's training in the source, where no agent is found
+    """
+
+    env_id: str
+    declared: tuple[str, ...]
+    lacks: tuple[str, float, tuple[str, ...]]
+    source_steps: int
+
+
+TASKS = {
+    "double-pendulum": Task(
+        "InvertedDoublePendulum-v5",
+        ("pole.length", "pole2.length", "cart.mass"),
+        ("coulomb_friction", 0.04, ("slider",)),
+        40_000,
+    ),
+    "hopper": Task(
+        "Hopper-v5",
+        ("torso.length", "thigh.length", "leg.length", "foot.length", "torso.mass", "foot_geom.friction"),
+        ("command_delay", 0.008, ("actuator0", "actuator1", "actuator2")),
+        300_000,
+    ),
+    "cheetah": Task(
+        "HalfCheetah-v5",
+        ("torso.length", "?thigh.length", "?shin.length", "?foot.length", "torso.mass", "floor.friction"),
+        ("coulomb_friction", 0.12, ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")),
+        300_000,
+    ),
+}
+SHORT, LONG = (250, 500, 1_000, 2_000), (250, 500, 1_000, 2_000, 5_000, 10_000, 20_000)
+ORACLE_STEPS = 100_000
+PHYSICAL = {"dynamics": "physical"}
+METHODS: dict[str, tuple[str, tuple[int, ...], dict[str, Any]]] = {
+    "zero-shot": ("zero-shot", (), {}),
+    "SAC-warm": ("sac-warm", LONG, {"gradient_steps": 1}),
+    "RPTO-ensemble": ("rpto", SHORT, {"dynamics": "ensemble"}),
+    "RPTO-physical, open loop": ("rpto", SHORT, PHYSICAL),
+    "RPTO-physical, closed loop": ("rpto", SHORT, {**PHYSICAL, "close_loop": True}),
+}
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run."""
+
+    task: str
+    shift: str
+    target: int
+    method: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its result file."""
+        return "_".join(map(str, asdict(self).values())).replace(" ", "-").replace(",", "")
+
+
+def jobs(tasks: Sequence[str], shifts: Sequence[str], targets: Sequence[int], seeds: Sequence[int]) -> list[Job]:
+    """All runs, seed by seed, so that an unfinished study is a fair sample.
+
+    :raises ValueError: an unknown task or shift
+    """
+    for name, given, known in (("tasks", tasks, tuple(TASKS)), ("shifts", shifts, SHIFTS)):
+        unknown = set(given) - set(known)
+        if unknown:
+            raise ValueError(f"{name}: {sorted(unknown)} do not exist; choose from {known}")
+    return [Job(*place, m, seed) for seed in seeds for place in product(tasks, shifts, targets) for m in METHODS]
+
+
+def shifted(task: str, shift: str, target: int) -> list[Effect]:
+    """What distinguishes a target from its source, drawn from its number."""
+    made = TASKS[task]
+    if shift == "none":
+        return []
+    env = gym.make(made.env_id)
+    model = env.unwrapped.model  # type: ignore[attr-defined]
+    rng = np.random.default_rng([target, *made.env_id.encode()])
+    effects: list[Effect] = [d.with_values(d.values * rng.uniform(0.8, 1.2, 1)) for d in declare(model, made.declared)]
+    kind, size, places = made.lacks
+    if shift == "undeclared":
+        for place in places:
+            effect = LIBRARY[kind](place)
+            effect.bind(model)
+            value = size * _peak(model, effect) if effect.place == "joint" else size
+            effects.append(effect.with_values(np.array([value])))
+    env.close()
+    return effects
+
+
+def _peak(model: Any, effect: Effect) -> float:
+    """Largest force that the motor of a joint gives, N·m or N."""
+    motors = np.flatnonzero(model.actuator_trnid[:, 0] == effect.index)
+    return float(np.abs(model.actuator_gear[motors[0], 0] * model.actuator_ctrlrange[motors[0]]).max())
+
+
+def make_source(task: str) -> gym.Env:
+    """The source of a task."""
+    return gym.make(TASKS[task].env_id)
+
+
+def make_target(task: str, shift: str, target: int) -> gym.Env:
+    """A target of a task."""
+    source = make_source(task)
+    effects = shifted(task, shift, target)
+    return apply_effects(source, effects) if effects else source
+
+
+@cache
+def source_agent(task: str, folder: Path) -> tuple[str, str | None]:
+    """The source's SAC and its transitions: found, or trained once and kept in ``folder``.
+
+    :return: paths; no transitions where the agent was found without them
+    """
+    made = TASKS[task]
+    given = Path(os.environ.get(FOLDER_VARIABLE, "../shared/sources"))
+    if (given / f"{made.env_id}.zip").exists():
+        data = given / f"{made.env_id}_transitions.npz"
+        return str(given / f"{made.env_id}.zip"), str(data) if data.exists() else None
+    path, data = folder / f"{made.env_id}.zip", folder / f"{made.env_id}_transitions.pkl"
+    if not path.exists():
+        model = SAC("MlpPolicy", make_source(task), seed=1_000, device="cpu")
+        model.learn(made.source_steps)
+        model.save_replay_buffer(data)
+        model.save(path)
+    load_transitions(data)
+    return str(path), str(data)
+
+
+def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISODES) -> Path:
+    """One run; its result file is written whole, so a killed study goes on where it stopped.
+
+    :param job: which
+    :param folder: for result files, source agents and oracles
+    :param budget: at most so many target steps; None: the study's
+    :param episodes: of an evaluation
+    """
+    path = folder / f"{job.name}.json"
+    if path.exists():
+        return path
+    th.set_num_threads(1)
+    method, points, settings = METHODS[job.method]
+    points = tuple(p for p in points if budget is None or p <= budget) or ((budget,) if points and budget else ())
+    agent, data = source_agent(job.task, folder)
+    target = partial(make_target, job.task, job.shift, job.target)
+    kwargs: dict[str, Any] = dict(settings)
+    if method == "rpto":
+        kwargs["source_data"] = data
+        if kwargs["dynamics"] == "physical":
+            kwargs["declared"] = list(TASKS[job.task].declared)
+    truth = {e.label: float(e.values[0]) for e in shifted(job.task, job.shift, job.target) if isinstance(e, Declared)}
+    rows = transfer(
+        method,
+        agent,
+        partial(make_source, job.task),
+        target,
+        max(points, default=0),
+        every=points,
+        seed=job.seed,
+        n_episodes=episodes,
+        read=partial(_read, truth),
+        **kwargs,
+    )
+    write_atomically(path, json.dumps([{**asdict(job), **row} for row in rows], indent=1) + "\n")
+    return path
+
+
+def _read(truth: dict[str, float], model: Any) -> dict[str, Any]:
+    """The model's error on D_target, phi's error, and what was traced so far."""
+    dynamics = getattr(model, "dynamics", None)
+    if dynamics is None:
+        return {}
+    row: dict[str, Any] = {}
+    if model.replay_buffer.target.size() > 1:
+        row["model_error"] = float(dynamics.error(model.transitions("target")))
+    known = dynamics.describe()
+    off = [abs(known[name] / value - 1) for name, value in truth.items() if name in known]
+    if off:
+        row["parameter_error"] = float(np.median(off))
+    if model.loop is not None and model.loop.found:
+        last = model.loop.found[-1]
+        row["verdict"] = last["verdict"]
+        row["named"] = "; ".join(sorted(set(dynamics.names) - set(truth)))
+    return row
+
+
+def oracle(task: str, shift: str, target: int, folder: Path, steps: int = ORACLE_STEPS) -> float:
+    """Return of a SAC fine-tuned long in the target, trained once and kept; warm-started, seed 0.
+
+    :param steps: target steps
+    """
+    path = folder / f"oracle_{task}_{shift}_{target}.json"
+    if not path.exists():
+        th.set_num_threads(1)
+        agent, _ = source_agent(task, folder)
+        rows = transfer(
+            "sac-warm",
+            agent,
+            partial(make_source, task),
+            partial(make_target, task, shift, target),
+            steps,
+            every=max(1, steps // 10),
+            n_episodes=EPISODES,
+        )
+        write_atomically(path, json.dumps({"return": max(row["return"] for row in rows), "steps": steps}) + "\n")
+    return float(json.loads(path.read_text())["return"])
+
+
+def collected(folder: Path) -> pd.DataFrame:
+    """All rows of all finished runs."""
+    names = {m.replace(" ", "-").replace(",", "") for m in METHODS}
+    files = [p for p in sorted(folder.glob("*.json")) if any(f"_{m}_" in p.name for m in names)]
+    return pd.DataFrame([row for p in files for row in json.loads(p.read_text())])
+
+
+def summary(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float]) -> pd.DataFrame:
+    """A line for each task, shift, method and number of target steps, over targets and seeds.
+
+    :param rows: of :func:`collected`
+    :param oracles: return of the oracle of each (task, shift, target)
+    :return: IQM of the return with its 95 % interval, of the share of the oracle's, runs, updates and source steps per
+        target step, seconds, median model and parameter errors, verdicts
+    """
+    best = pd.Series([oracles.get(key, np.nan) for key in zip(rows.task, rows["shift"], rows.target)], rows.index)
+    rows = rows.assign(share=rows["return"] / best)
+    lines = []
+    for key, part in rows.groupby(["task", "shift", "method", "steps"], sort=False):
+        middle, low, high = iqm_interval(part["return"].to_numpy())
+        steps = max(int(key[3]), 1)
+        line = dict(zip(("task", "shift", "method", "steps"), key))
+        line |= {"runs": len(part), "iqm": middle, "low": low, "high": high, "share": part["share"].mean()}
+        line |= {f"{n}_per_step": part[n].mean() / steps for n in ("updates", "source_steps")}
+        line["seconds"] = part["seconds"].mean()
+        for name in ("model_error", "parameter_error"):
+            line[name] = part[name].median() if name in part else np.nan
+        verdicts = part["verdict"].dropna() if "verdict" in part else pd.Series(dtype=str)
+        line["verdicts"] = ", ".join(f"{n}× {v}" for v, n in verdicts.value_counts().items())
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def steps_to(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float], share: float = 0.9) -> pd.DataFrame:
+    """First evaluation at which each run reached a share of its oracle: quartiles over runs, and how many did."""
+    lines = []
+    for (task, shift, method), part in rows.groupby(["task", "shift", "method"], sort=False):
+        reached = []
+        for (target, _), one in part.groupby(["target", "seed"]):
+            enough = one[one["return"] >= share * oracles.get((task, shift, target), np.inf)]
+            reached.append(float(enough.steps.min()) if len(enough) else np.inf)
+        q = np.quantile(np.array(reached), [0.25, 0.5, 0.75], method="nearest")
+        line = {"task": task, "shift": shift, "method": method, "runs": len(reached)}
+        lines.append(line | dict(zip(("q25", "median", "q75"), q)) | {"reached": int(np.isfinite(reached).sum())})
+    return pd.DataFrame(lines)
+
+
+def fingerprint() -> str:
+    """SHA-256 of the targets' numbers, so that two tables can be told to be of the same ones."""
+    drawn = {
+        f"{task}/{shift}/{i}": [(e.label, e.values.round(12).tolist()) for e in shifted(task, shift, i)]
+        for task in TASKS
+        for shift in SHIFTS
+        for i in TARGETS
+    }
+    return hashlib.sha256(json.dumps(drawn, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,91 @@
+"""The study of the closed loop: its targets, its jobs and what its tables say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+
+from sb3_rpto.effects import Declared
+from sb3_rpto.experiments import closed_loop as study
+
+
+@pytest.mark.parametrize("task", study.TASKS)
+def test_targets_are_fixed_within_20_percent_and_differ(task: str) -> None:
+    first, again, other = (study.shifted(task, "declared", i) for i in (0, 0, 1))
+    factors = np.array([e.values[0] / e.parameters[0].null for e in first])
+    assert np.all((factors >= 0.8) & (factors <= 1.2))
+    assert len(set(factors.round(9))) == len(factors)
+    np.testing.assert_array_equal([e.values for e in first], [e.values for e in again])
+    assert not np.allclose([e.values for e in first], [e.values for e in other])
+
+
+@pytest.mark.parametrize("task", study.TASKS)
+def test_the_undeclared_effect_comes_on_top_of_the_same_declared_shift(task: str) -> None:
+    declared, both = study.shifted(task, "declared", 0), study.shifted(task, "undeclared", 0)
+    np.testing.assert_array_equal([e.values for e in declared], [e.values for e in both if isinstance(e, Declared)])
+    more = [e for e in both if not isinstance(e, Declared)]
+    assert [e.kind for e in more] == [study.TASKS[task].lacks[0]] * len(study.TASKS[task].lacks[2])
+    assert all(e.values[0] > 0 for e in more)
+
+
+@pytest.mark.parametrize(("shift", "same"), [("none", True), ("declared", False), ("undeclared", False)])
+def test_a_target_differs_from_its_source_where_it_should(shift: str, same: bool) -> None:
+    envs = study.make_source("double-pendulum"), study.make_target("double-pendulum", shift, 0)
+    steps = [(env.reset(seed=0), env.step(np.array([0.5])))[1][0] for env in envs]
+    assert np.array_equal(*steps) == same
+
+
+def test_an_undeclared_friction_is_its_share_of_the_motors_peak() -> None:
+    effects = {e.label: e for e in study.shifted("cheetah", "undeclared", 0)}
+    model = gym.make("HalfCheetah-v5").unwrapped.model  # type: ignore[attr-defined]
+    assert effects["coulomb_friction(bthigh)"].values[0] == pytest.approx(0.12 * model.actuator_gear[0, 0])
+
+
+def test_an_unfinished_study_is_a_fair_sample() -> None:
+    listed = study.jobs(["hopper"], study.SHIFTS, study.TARGETS, range(2))
+    assert len(listed) == len({job.name for job in listed}) == 3 * 2 * 2 * len(study.METHODS)
+    assert [job.seed for job in listed] == sorted(job.seed for job in listed)
+
+
+def test_unknown_names_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"tasks.*ant"):
+        study.jobs(["ant"], ["none"], [0], [0])
+
+
+def rows() -> pd.DataFrame:
+    lines = []
+    for seed in range(3):
+        for steps, value in ((0, 100.0), (250, 500.0 + 100 * seed), (500, 950.0)):
+            line = {"task": "hopper", "shift": "none", "target": 0, "method": "SAC-warm", "seed": seed, "steps": steps}
+            lines.append({**line, "return": value, "updates": 2 * steps, "source_steps": 0, "seconds": 1.0})
+    return pd.DataFrame(lines)
+
+
+def test_summary_says_what_was_spent_for_what() -> None:
+    table = study.summary(rows(), {("hopper", "none", 0): 1000.0}).set_index("steps")
+    assert table.loc[250, "iqm"] == pytest.approx(600)
+    assert table.loc[500, "share"] == pytest.approx(0.95)
+    assert table.loc[500, "updates_per_step"] == pytest.approx(2)
+    assert table.loc[0, "runs"] == 3
+
+
+def test_steps_to_a_share_of_the_oracle() -> None:
+    line = study.steps_to(rows(), {("hopper", "none", 0): 760.0}).iloc[0]
+    # 684 is reached at once by the third seed alone.
+    assert (line["median"], line["reached"]) == (500, 3)
+    assert study.steps_to(rows(), {("hopper", "none", 0): 2000.0}).iloc[0]["reached"] == 0
+
+
+def test_finished_runs_are_not_repeated_and_are_collected(tmp_path: Path) -> None:
+    job = study.Job("double-pendulum", "none", 0, "zero-shot", 0)
+    path = tmp_path / f"{job.name}.json"
+    path.write_text(json.dumps([{"task": "double-pendulum", "return": 1.0}]))
+    (tmp_path / "oracle_double-pendulum_none_0.json").write_text(json.dumps({"return": 2.0}))
+    assert study.run(job, tmp_path) == path
+    assert study.oracle("double-pendulum", "none", 0, tmp_path) == 2.0
+    assert study.collected(tmp_path)["return"].tolist() == [1.0]
