@@ -141,7 +141,8 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
         )
     if source_timesteps is not None and (not _is_integer(source_timesteps) or source_timesteps < 0):
         raise ValueError(f"source_timesteps must be an integer and not negative, got {source_timesteps!r}")
-    if model._offline and model.weighting is not None and not model.replay_buffer.target.rewards.any():
+    needs_rewards = model._offline and model.weighting is not None and not model._traces_log
+    if needs_rewards and not model.replay_buffer.target.rewards.any():
         raise ValueError("target_data holds no rewards, which RTO's weight needs; pass weighting=None")
     capacity = model.replay_buffer.target.buffer_size
     if model.target_env is not None and total_timesteps > capacity:

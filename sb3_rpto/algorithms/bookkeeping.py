@@ -87,7 +87,7 @@ class TwoWorlds(PolicySnapshots):
         if self.env is not None:
             check_pair(self.env, venv)
         self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
-        self._offline = False
+        self._offline = self._traces_log = False
         self._last_obs = None
         if self.seed is not None:
             self.target_env.seed(self.seed + TARGET_SEED_OFFSET)

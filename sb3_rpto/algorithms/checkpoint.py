@@ -25,6 +25,7 @@ Self = TypeVar("Self", bound="Resumable")
 #: Kept out of the zip: saved by other means, rebuilt, or of no use without the environments.
 NOT_SAVED = (
     "target_env",
+    "measured",
     "dynamics",
     "_source_world",
     "_null_check",

@@ -1,4 +1,4 @@
-"""Close the loop inside ``learn()``: trace on D_target what the simulator lacks, and add it to phi."""
+"""Close the loop inside ``learn()``: trace on D_target or on a robot's log what the simulator lacks, add it to phi."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_rpto.algorithms import warm
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Declared
@@ -26,8 +27,11 @@ RISEN = 2.0
 WINDOW = 4
 #: What is found is kept when the one-step error falls below this share of the best without it.
 WORTH = 0.9
-#: Source steps taken in the corrected simulator before learning goes on there.
-FRESH = 2_000
+#: Source steps taken in the corrected simulator, with the updates that belong to them, before the next target step:
+#: there the policy learns what it can for nothing.
+FRESH = 10_000
+#: Of these, the first only fill D_source.
+FILL = 1_000
 #: A corrected simulator must stay finite for so many steps from states of the target, as the uncorrected one does.
 TRIAL_STATES, TRIAL_STEPS = 16, 20
 
@@ -36,7 +40,7 @@ class LoopCloser:
     """Decides when to trace, traces, and takes what is found into phi; it never spends a target step.
 
     :param declared: names of the numbers that the user declared
-    :param kinds: of effects to look for; None: all
+    :param kinds: of effects to look for; None: all; none of them: the declared numbers alone are fitted
     """
 
     def __init__(self, declared: tuple[str, ...], kinds: Sequence[str] | None = None) -> None:
@@ -46,6 +50,8 @@ class LoopCloser:
         self.found: list[dict[str, Any]] = []
         self._traced_at = 0
         self._error = math.inf
+        #: whether D_source holds what an uncorrected source produced
+        self.stale = False
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "reports": []}
@@ -66,10 +72,41 @@ class LoopCloser:
         data = model.transitions("target")
         before = dynamics.error(data)
         measured = Measurements.from_replay(model.replay_buffer, model.env)
-        env = single_env(model.env)
-        horizon = (WINDOW - 1) * float(env.unwrapped.dt)  # type: ignore[attr-defined]
+        horizon = (WINDOW - 1) * float(single_env(model.env).unwrapped.dt)  # type: ignore[attr-defined]
+        report = self._trace(model, dynamics, measured, horizon)
+        self._traced_at = len(data)
+        added = self._take(model, dynamics, report, data, before)
+        self._error = dynamics.error(data)
+        _say(model, report, added, f"{len(data)} target transitions", before, self._error)
+        if added:
+            renew_source(model)
+
+    def close_on_log(self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements) -> None:
+        """Trace on a robot's log itself, by multiple shooting: one-step errors of noisy samples tell next to nothing.
+
+        phi takes all that is found, as long as the simulator with it is stable; D_target is read anew, as the corrected
+        environment shows it. What the uncorrected source produced is :attr:`stale` from then on.
+        """
+        data = model.transitions("target")
+        before = dynamics.error(data)
+        report = self._trace(model, dynamics, measured, None)
+        added = self._take(model, dynamics, report, data, math.inf)
+        warm.fill_recorded(model, measured, dynamics.effects())
+        self.stale = True
+        _say(model, report, added, f"{len(measured.episodes)} recorded episodes", before, dynamics.error(data))
+
+    def renew(self, model: TransferAlgorithm) -> None:
+        """Drop what is :attr:`stale`, if anything is."""
+        if self.stale:
+            self.stale = False
+            renew_source(model)
+
+    def _trace(
+        self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements, horizon: float | None
+    ) -> Report:
+        assert model.env is not None
         report = trace(
-            env,
+            single_env(model.env),
             measured,
             self.declared,
             seed=model.seed or 0,
@@ -79,20 +116,7 @@ class LoopCloser:
         )
         self.reports.append(report)
         self.found.append(report.to_json())
-        self._traced_at = len(data)
-        added = self._take(model, dynamics, report, data, before)
-        self._error = dynamics.error(data)
-        logger = model.logger
-        logger.record("gap/residual_before", before)
-        logger.record("gap/residual_after", self._error)
-        logger.record("gap/adequacy_before", report.adequacy_before.ratio)
-        logger.record("gap/adequacy_after", report.adequacy_after.ratio)
-        logger.record("gap/verdict", report.verdict)
-        logger.record("gap/effects", ", ".join(added) or "none", exclude="tensorboard")
-        if model.verbose:
-            print(f"traced on {len(data)} target transitions: {report.verdict}; {', '.join(added) or 'nothing'} added")
-        if added:
-            renew_source(model)
+        return report
 
     def _take(
         self,
@@ -102,7 +126,10 @@ class LoopCloser:
         data: Transitions,
         before: float,
     ) -> list[str]:
-        """Let phi have the effects that were found, if that pays; the labels of those that are new."""
+        """Let phi have the effects that were found, if that pays; the labels of those that are new.
+
+        :param before: error of ``data`` without them; infinite: no matter
+        """
         known = {effect.label for effect in dynamics.effects()}
         found = [traced.effect for traced in (*report.declared, *report.effects)]
         new = [effect.label for effect in found if effect.label not in known and not isinstance(effect, Declared)]
@@ -116,8 +143,7 @@ class LoopCloser:
                 stacklevel=4,
             )
             return []
-        after = dynamics.error(data)
-        if not after < (WORTH if new else 1.0) * before:
+        if before < math.inf and not dynamics.error(data) < (WORTH if new else 1.0) * before:
             dynamics.replace(kept)
             return []
         assert model.dynamics_config is not None
@@ -125,18 +151,40 @@ class LoopCloser:
         return new
 
 
+def _say(model: TransferAlgorithm, report: Report, added: list[str], data: str, before: float, after: float) -> None:
+    """Log what a trace found, and what it did to the one-step error."""
+    logger = model.logger
+    logger.record("gap/residual_before", before)
+    logger.record("gap/residual_after", after)
+    logger.record("gap/adequacy_before", report.adequacy_before.ratio)
+    logger.record("gap/adequacy_after", report.adequacy_after.ratio)
+    logger.record("gap/verdict", report.verdict)
+    logger.record("gap/effects", ", ".join(added) or "none", exclude="tensorboard")
+    if model.verbose:
+        print(f"traced on {data}: {report.verdict}; {', '.join(added) or 'nothing'} added")
+
+
 def stays_finite(dynamics: PhysicalDynamics, data: Transitions) -> bool:
     """Whether the simulator runs on from states of the target under the target's own actions.
 
     :param data: transitions of the target, oldest first
     """
+    if not len(data):
+        return True
     count = max(1, len(data) - TRIAL_STEPS)
     first = np.unique(np.linspace(0, count - 1, TRIAL_STATES).astype(int))
     return dynamics.runs(data, first, min(TRIAL_STEPS, len(data)))
 
 
 def renew_source(model: TransferAlgorithm) -> None:
-    """Drop what an uncorrected source produced, and act in the corrected one before learning goes on."""
-    assert model._source_world is not None
+    """Drop what an uncorrected source produced, and learn in the corrected one before the next target step."""
+    source = model._source_world
+    assert source is not None
     model.replay_buffer.source.reset()
-    model.source_timesteps += model._source_world.interact(model, min(FRESH, model.replay_buffer.source.buffer_size))
+    steps = source.interact(model, min(FILL, FRESH))
+    updates_per_step = max(model.gradient_steps, 1) / int(model.source_steps)
+    while steps < FRESH:
+        taken = source.interact(model, int(model.source_steps))
+        model.train(round(taken * updates_per_step), model.batch_size)
+        steps += taken
+    model.source_timesteps += steps

@@ -28,6 +28,7 @@ from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.weights import WeightingName
 from sb3_rpto.presets import resolve_preset
+from sb3_rpto.tracing import Measurements
 
 Self = TypeVar("Self", bound="TransferAlgorithm")
 
@@ -45,8 +46,11 @@ class TransferAlgorithm(Resumable):
     TARGET step and ``learning_starts`` applies to the source alone (no random action is ever taken in the target).
 
     :param target_env: the scarce world, an environment, a VecEnv or an id; ``learn()`` needs it or ``target_data``
-    :param target_data: transitions of the target recorded beforehand (a replay buffer, its pickle or an ``.npz``),
-        in place of ``target_env`` (RTO and RPTO)
+    :param target_data: the target recorded beforehand, in place of ``target_env`` (RTO and RPTO): transitions (a replay
+        buffer, its pickle or an ``.npz``), or :class:`~sb3_rpto.tracing.Measurements` of a robot, on the joints and
+        actuators of ``env``'s MuJoCo model. D_target then holds the steps that ``env`` would have taken there
+        (:func:`~sb3_rpto.algorithms.recorded.transitions`), and with ``dynamics="physical"`` phi comes from one
+        :func:`~sb3_rpto.tracing.trace` of the recordings, at the start of ``learn()``, in place of one-step fits
     :param preset: hyperparameters for what is not passed: "default", "paper" or "author"
     :param dynamics: backend of the trainable source: "ensemble" (networks), "physical" (a simulator with trainable
         numbers) or "residual" (that simulator and a small ensemble on what it still misses)
@@ -54,7 +58,7 @@ class TransferAlgorithm(Resumable):
     :param declared: names of the physical parameters to fit (physical backend)
     :param close_loop: trace on D_target what the simulator lacks beside the declared numbers, add it to phi and go on
         (``dynamics="physical"`` on MuJoCo); a list looks for effects of these kinds alone. The reports are in
-        ``model.loop.reports``
+        ``model.loop.reports`` (with Measurements also where only the declared numbers are fitted)
     :param weighting: RTO's weight: "paper", "centred", "value_aware", or None (plain supervised learning)
     :param weight_floor: epsilon of the paper: the smallest weight, above 0 or equal to it
     :param real_ratio: share of target transitions in the critic's batches, in [0, 1); 0 in the paper
@@ -111,7 +115,7 @@ class TransferAlgorithm(Resumable):
         _init_setup_model: bool = True,
         *,
         target_env: GymEnv | str | None = None,
-        target_data: ReplayBuffer | str | pathlib.Path | None = None,
+        target_data: ReplayBuffer | str | pathlib.Path | Measurements | None = None,
         preset: str = "default",
         dynamics: Literal["ensemble", "physical", "residual"] = "ensemble",
         dynamics_kwargs: dict[str, Any] | None = None,
@@ -166,7 +170,7 @@ class TransferAlgorithm(Resumable):
         self.dynamics_kwargs = dict(dynamics_kwargs or {})
         self.declared = tuple(declared)
         self.close_loop = close_loop
-        #: traces what the simulator lacks, and holds the reports; None with the loop open
+        #: traces what the simulator lacks, and holds the reports; None with the loop open and no log to trace on
         self.loop = None if not close_loop else LoopCloser(self.declared, None if close_loop is True else close_loop)
         self.weighting = weighting
         self.weight_floor = weight_floor
@@ -183,6 +187,9 @@ class TransferAlgorithm(Resumable):
         self.snapshots = {}
         self.best_mean_reward = -np.inf
         self._offline = target_data is not None
+        #: the log that stands in for the target; a checkpoint does not hold it
+        self.measured = target_data if isinstance(target_data, Measurements) else None
+        self._traces_log = False
         self._warm = False
         self._pretraining = False
         self._pretrained_steps = 0
@@ -207,6 +214,9 @@ class TransferAlgorithm(Resumable):
             self._setup_model()
             if target_env is not None:
                 self.set_target_env(target_env)
+            if self.measured is not None and isinstance(self.dynamics, PhysicalDynamics):
+                self._traces_log = True
+                self.loop = self.loop or LoopCloser(self.declared, kinds=[])
             if target_data is not None:
                 warm.fill_target(self, target_data)
                 self._since_fit = self.model_train_freq  # all data are there: the first fit need not wait
@@ -332,8 +342,11 @@ class TransferAlgorithm(Resumable):
         self._source_world = self._source_world or make_source_world(
             self.env, self.dynamics, self.rollout_start, int(self.source_steps)
         )
+        self._trace_log()  # first of all: the log may be refused
         warm.begin_in_source(self, source_timesteps, progress_bar)
         inside_rollout = checkpoint.resume(self)
+        if self.loop is not None:
+            self.loop.renew(self)
         self._watch_for_null_shift()
         self._callback = callback
         callback.on_training_start(locals(), globals())
@@ -389,8 +402,19 @@ class TransferAlgorithm(Resumable):
         self._collected = rollout.episode_timesteps
         return rollout.continue_training
 
+    def _trace_log(self) -> None:
+        """Once, before anything is learned: phi from a trace of the robot's log, where one was given."""
+        if self._traces_log and self.loop is not None and not self.loop.found:
+            assert isinstance(self.dynamics, PhysicalDynamics)  # else there is nothing to trace for
+            if self.measured is None:
+                raise ValueError(
+                    "this model was saved before its recordings were traced, and a checkpoint does not hold them: set "
+                    "model.measured = Measurements.from_csv(...) again"
+                )
+            self.loop.close_on_log(self, self.dynamics, self.measured)
+
     def _close_the_loop(self) -> None:
-        if self.loop is not None:
+        if self.loop is not None and self.close_loop:
             assert isinstance(self.dynamics, PhysicalDynamics)  # checked by the constructor
             if self.loop.due(self, self.dynamics):
                 self.loop.close(self, self.dynamics)

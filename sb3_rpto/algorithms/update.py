@@ -47,6 +47,8 @@ class RelativeUpdate(SAC):
     _actor_updates: int
     #: recorded data stand in for the target
     _offline: bool
+    #: those are measurements, and phi comes from a trace of them instead of from fits to transitions
+    _traces_log: bool
 
     def update(self) -> None:
         """Steps 5 and 6: ``gradient_steps`` updates of critic and actor for each new target step, then the dynamics."""
@@ -98,9 +100,16 @@ class RelativeUpdate(SAC):
     def fit_dynamics(self) -> None:
         """Step 6, RTO: every ``model_train_freq`` target steps move phi towards D_target by the weighted loss."""
         self._since_fit += self._collected
-        if not self.updates_dynamics or self._since_fit < self.model_train_freq or self.replay_buffer.size() < 2:
+        ready = self._traces_log or self.replay_buffer.size() >= 2
+        if not self.updates_dynamics or self._since_fit < self.model_train_freq or not ready:
             return
         self._since_fit = 0
+        if not self._traces_log:
+            self._fit_to_transitions()
+        if self._offline:  # SB3 writes its logs at the end of target episodes; there are none
+            self.dump_logs()
+
+    def _fit_to_transitions(self) -> None:
         assert self.dynamics is not None
         self._adopt_target_rules()
         self.policy.set_training_mode(False)  # values for the weights: no dropout, no new batch statistics
@@ -124,8 +133,6 @@ class RelativeUpdate(SAC):
         for name, value in self.dynamics.describe().items():
             self.logger.record(f"dynamics/{name}", value)
         self.logger.record("dynamics/error", self.dynamics.error(data))
-        if self._offline:  # SB3 writes its logs at the end of target episodes; there are none
-            self.dump_logs()
 
     def _adopt_target_rules(self) -> None:
         """From the first fit on the model is one of the target: let what is known of the task be the target's."""

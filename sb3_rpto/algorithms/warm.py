@@ -5,18 +5,23 @@ from __future__ import annotations
 import copy
 import pathlib
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 
+from sb3_rpto.algorithms import recorded
 from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.algorithms.update import as_transitions
 from sb3_rpto.buffers import World, load_transitions
 from sb3_rpto.dynamics.base import Dynamics
+from sb3_rpto.effects import Effect
+from sb3_rpto.envs.observations import single_env
 from sb3_rpto.envs.rules import task_rules
+from sb3_rpto.tracing import Measurements
 
 #: Source steps that fit phi_0 when no source data are given, and the cap of gradient steps of that fit.
 PHI_0_STEPS, PHI_0_UPDATES = 25_000, 5_000
@@ -82,11 +87,44 @@ def fill_source(model: Resumable, source_data: ReplayBuffer | str | pathlib.Path
     model.replay_buffer.source_starts = arrays["observations"].astype(model.observation_space.dtype)
 
 
-def fill_target(model: Resumable, target_data: ReplayBuffer | str | pathlib.Path) -> None:
+def fill_target(model: Resumable, target_data: ReplayBuffer | str | pathlib.Path | Measurements) -> None:
     """Put recorded target transitions into D_target; rewards that were not recorded come from the task's reward_fn."""
+    if isinstance(target_data, Measurements):
+        fill_recorded(model, target_data)
+        return
     arrays = _checked(load_transitions(target_data, "target", rewards_optional=True), model, "target_data")
     if "rewards" not in arrays:
         arrays["rewards"] = _rewards(model, arrays)
+    _append_newest(model, "target", arrays)
+
+
+def fill_recorded(model: Resumable, measured: Measurements, effects: Sequence[Effect] = ()) -> None:
+    """Let D_target hold what a robot's log tells, and nothing else.
+
+    :param model: with its source
+    :param measured: the log
+    :param effects: what is known to be in the machine beside the source
+    :raises ValueError: a log of another machine; none of its steps is one of the task where phi is fitted to steps;
+        rewards that are not known where they are needed
+    """
+    assert model.env is not None
+    rules = {name: model.dynamics_kwargs.get(name) for name in ("reward_fn", "termination_fn")}
+    arrays = recorded.transitions(measured, single_env(model.env), effects, **rules)
+    model.replay_buffer.target.reset()
+    if not len(arrays["actions"]):
+        message = "target_data holds no whole step that begins where the task goes on"
+        if not model._traces_log:
+            raise ValueError(f"{message}: record motion of the task, for longer than a step without gaps")
+        warnings.warn(f"{message}: it corrects the simulator, and the policy learns there alone", stacklevel=4)
+        return
+    if "rewards" not in arrays:
+        if (model.weighting is not None and not model._traces_log) or model.real_ratio > 0:
+            raise ValueError(
+                "target_data: measurements hold no rewards and the task's are not known, which RTO's weight and the "
+                "critic need; pass weighting=None and real_ratio=0, or, to the ensemble, "
+                "dynamics_kwargs={'reward_fn': f} with f(observations, actions, next_observations) -> (n,)"
+            )
+        arrays["rewards"] = np.zeros(len(arrays["actions"]))
     _append_newest(model, "target", arrays)
 
 

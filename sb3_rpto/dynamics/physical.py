@@ -38,22 +38,33 @@ def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
     """
     single = single_env(env)
     model, recover = mujoco_model(single), state_map(single)
-    if single.action_space.shape != (model.nu,):
-        raise ValueError(
-            f"{env_name(single)}: actions have shape {single.action_space.shape}, the model {model.nu} actuators; "
-            "dynamics='physical' needs actions that are the commands of the actuators"
-        )
-    for layer in layers(single)[:-1]:
-        # Clipping is what the actuators do themselves.
-        if isinstance(layer, gym.ActionWrapper) and not isinstance(layer, ClipAction):
-            raise ValueError(
-                f"{env_name(single)}: the wrapper {type(layer).__name__} changes actions, and dynamics='physical' "
-                "needs those that are the commands of the actuators; give it an environment without"
-            )
+    check_commands(single, "dynamics='physical'")
     frame_skip = getattr(single.unwrapped, "frame_skip", None)
     if frame_skip is None:
         raise ValueError(f"{env_name(single)} has no frame_skip; derive it from gymnasium.envs.mujoco.MujocoEnv")
     return {"model": model.__copy__(), "recover": recover, "frame_skip": int(frame_skip)}
+
+
+def check_commands(env: gym.Env, what: str) -> None:
+    """Require that actions are the commands of the actuators.
+
+    :param env: a MuJoCo environment with all its wrappers
+    :param what: needs it, for the message
+    :raises ValueError: actions of another shape than the model's commands, wrappers that change them
+    """
+    model = mujoco_model(env)
+    if env.action_space.shape != (model.nu,):
+        raise ValueError(
+            f"{env_name(env)}: actions have shape {env.action_space.shape}, the model {model.nu} actuators; "
+            f"{what} needs actions that are the commands of the actuators"
+        )
+    for layer in layers(env)[:-1]:
+        # Clipping is what the actuators do themselves.
+        if isinstance(layer, gym.ActionWrapper) and not isinstance(layer, ClipAction):
+            raise ValueError(
+                f"{env_name(env)}: the wrapper {type(layer).__name__} changes actions, and {what} needs those that "
+                "are the commands of the actuators; give it an environment without"
+            )
 
 
 class PhysicalDynamics(Dynamics):

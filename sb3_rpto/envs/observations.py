@@ -155,7 +155,7 @@ def state_map(env: gym.Env) -> StateMap:
         make = next((_registered[cls] for cls in type(base).__mro__ if cls in _registered), None)
     if make is None:
         for layer in layers(env)[:-1]:
-            if not _leaves_observations(layer):
+            if not leaves_observations(layer):
                 raise ValueError(
                     f"{name}: what the wrapper {type(layer).__name__} makes of the observations is not known; give the "
                     "environment without it where it leaves them as they are, else use register_state_map"
@@ -173,7 +173,8 @@ def state_map(env: gym.Env) -> StateMap:
     return StateMap(name, (model.nq, model.nv), shape[0], make(env))
 
 
-def _leaves_observations(layer: gym.Env) -> bool:
+def leaves_observations(layer: gym.Env) -> bool:
+    """Whether a wrapper is known to pass observations on as they are."""
     if isinstance(layer, gym.ObservationWrapper):
         return False
     own = type(layer).__module__.startswith("sb3_rpto.")

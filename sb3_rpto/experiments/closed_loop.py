@@ -202,7 +202,7 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
         read=partial(_read, truth),
         **kwargs,
     )
-    write_atomically(path, json.dumps([{**asdict(job), **row} for row in rows], indent=1) + "\n")
+    write_atomically(path, json.dumps([{**row, **asdict(job)} for row in rows], indent=1) + "\n")
     return path
 
 

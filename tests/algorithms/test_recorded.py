@@ -1,0 +1,287 @@
+"""A robot's log in place of a target: D_target from it, and phi from a trace of it."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import SMALL_ENSEMBLE, SMALL_POLICY
+from stable_baselines3 import SAC
+
+from sb3_rpto import RPTO, RTO
+from sb3_rpto.algorithms import closing
+from sb3_rpto.algorithms.recorded import transitions
+from sb3_rpto.buffers import chronological
+from sb3_rpto.dynamics.physical import PhysicalDynamics
+from sb3_rpto.effects import LIBRARY, Effect, declare
+from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.tracing import Measurements, windows
+
+TASK, DT = "InvertedPendulum-v5", 0.04
+RATE, EVERY = 0.01, 4  # s between samples, samples between decisions
+GAINS = np.array([-0.741, -6.023, -0.868, -1.012])  # balance the pole
+DAMPING, LEVEL = 1.4, 12.0
+FRICTION = LIBRARY["coulomb_friction"]("slider", level=LEVEL)
+
+
+def robot(lacks: tuple[Effect, ...] = ()) -> gym.Env:
+    """The task with another damping and what nobody declared, in steps of a sample."""
+    env = gym.make(TASK, frame_skip=2)
+    base: Any = env.unwrapped
+    base.model.opt.timestep = RATE / 2
+    return apply_effects(env, [declare(base.model, ["hinge.damping"])[0].with_values(np.array([DAMPING])), *lacks])
+
+
+@cache
+def table(friction: bool = False, noise: float = 3e-4, episodes: int = 4, decisions: int = 45) -> dict[str, np.ndarray]:
+    """The columns of a log, and the true velocities in ``true``; the robot is balanced and pushed about."""
+    env = robot((FRICTION,) if friction else ())
+    data: Any = env.unwrapped.data  # type: ignore[attr-defined]
+    rng = np.random.default_rng(0)
+    rows = []
+    for episode in range(episodes):
+        env.reset(seed=episode)
+        for k in range(decisions * EVERY + 1):
+            if k % EVERY == 0:
+                state = np.concatenate([data.qpos, data.qvel])
+                command = np.clip(-GAINS @ state + 0.7 * rng.uniform(-1, 1), -3, 3)
+            rows.append(
+                [episode, k * RATE, *(data.qpos + noise * rng.standard_normal(2)), command, *data.qpos, *data.qvel]
+            )
+            env.step(np.array([command]))
+    columns = np.array(rows).T
+    names = ["episode", "time", "qpos.slider", "qpos.hinge", "ctrl.slide"]
+    return {**dict(zip(names, columns)), "episode": columns[0].astype(int).astype(str), "true": columns[5:].T}
+
+
+def log(keep: Any = slice(None), **kwargs: Any) -> Measurements:
+    """The log, of which some rows are kept."""
+    return Measurements.from_tables({"log": {n: c[keep] for n, c in table(**kwargs).items() if n != "true"}})
+
+
+def model(measured: Measurements, cls: type = RPTO, env: gym.Env | None = None, **kwargs: Any) -> Any:
+    settings: dict[str, Any] = {
+        **{"dynamics": "physical", "declared": ["hinge.damping"], "policy_kwargs": SMALL_POLICY, "device": "cpu"},
+        **{"source_steps": 4, "gradient_steps": 1, "batch_size": 32, "model_train_freq": 5, "seed": 0, **kwargs},
+    }
+    return cls("MlpPolicy", env or gym.make(TASK), target_data=measured, **settings)
+
+
+# --- D_target ---------------------------------------------------------------------------------------------------------
+
+
+def test_transitions_of_a_simulator_come_back() -> None:
+    env = gym.make(TASK)
+    agent = SAC("MlpPolicy", env, learning_starts=120, seed=0, device="cpu").learn(120)
+    kept = chronological(agent.replay_buffer)  # type: ignore[arg-type]
+    found = transitions(Measurements.from_replay(agent.replay_buffer, env), env)  # type: ignore[arg-type]
+    assert kept["terminations"].sum() > 5
+    for name, array in found.items():
+        np.testing.assert_allclose(array, kept[name][: len(array)], atol=1e-6, err_msg=name)  # the buffer has float32
+    assert len(found["actions"]) >= 117  # an episode of one transition is none to measure on
+
+
+def test_noisy_samples_are_smoothed_onto_the_grid_of_the_environment() -> None:
+    found = transitions(log(episodes=1), gym.make(TASK))
+    truth, commands = table(episodes=1)["true"], table(episodes=1)["ctrl.slide"]
+    nodes = np.arange(EVERY, len(truth) - EVERY, EVERY)  # cubics that lean to one side are left out at the ends
+    assert len(found["actions"]) == len(nodes) - 1
+    np.testing.assert_allclose(found["observations"][:, :2], truth[nodes[:-1], :2], atol=1.2e-3)
+    error = found["next_observations"][:, 2:] - truth[nodes[1:], 2:]
+    assert np.sqrt((error**2).mean()) < 0.15 * truth[:, 2:].std()  # forces jump at the nodes, cubics do not
+    np.testing.assert_allclose(found["actions"][:, 0], commands[nodes[:-1]] / 3, atol=1e-9)
+    assert (found["rewards"] == 1).all()
+    assert not found["terminations"].any()
+
+
+def test_the_grid_begins_where_commands_change() -> None:
+    found = transitions(log(slice(3, None), episodes=1), gym.make(TASK))
+    commands = table(episodes=1)["ctrl.slide"][::EVERY] / 3
+    first = int(np.argmin(np.abs(commands - found["actions"][0, 0])))
+    np.testing.assert_allclose(found["actions"][:, 0], commands[first : first + len(found["actions"])], atol=1e-9)
+
+
+def test_steps_end_between_samples_too() -> None:
+    """A log of 40 Hz under steps of 40 ms, without noise."""
+    env = gym.make(TASK)
+    time = 0.025 * np.arange(60)
+    swing = {"time": time, "qpos.slider": 0.1 * np.sin(3 * time), "qvel.slider": 0.3 * np.cos(3 * time)}
+    swing |= {"qpos.hinge": 0.05 * np.cos(2 * time), "qvel.hinge": -0.1 * np.sin(2 * time), "ctrl.slide": time}
+    found = transitions(replace(Measurements.from_tables({"swing": swing}), exact=True), env)
+    at = DT * np.arange(len(found["actions"]))
+    truth = np.stack([0.1 * np.sin(3 * at), 0.05 * np.cos(2 * at), 0.3 * np.cos(3 * at), -0.1 * np.sin(2 * at)], axis=1)
+    np.testing.assert_allclose(found["observations"], truth, atol=1e-5)
+    assert len(at) == int(time[-1] / DT)
+
+
+def test_no_step_spans_what_was_not_measured() -> None:
+    rows = np.delete(np.arange(181), np.arange(60, 80))
+    whole, gap = transitions(log(episodes=1), gym.make(TASK)), transitions(log(rows, episodes=1), gym.make(TASK))
+    assert len(whole["actions"]) - len(gap["actions"]) in range(5, 9)
+    measured = log(episodes=1)
+    (episode,) = measured.episodes
+    off = episode.enabled.copy()
+    off[90] = False
+    lost = transitions(replace(measured, episodes=[replace(episode, enabled=off)]), gym.make(TASK))
+    assert len(whole["actions"]) - len(lost["actions"]) in range(2, 5)  # with those whose smoothing reaches there
+
+
+def test_steps_after_the_end_of_the_task_are_left_out() -> None:
+    measured = log(episodes=1)
+    (episode,) = measured.episodes
+    tilted = episode.qpos + np.outer(np.maximum(0, episode.time - 1.0), [0, 1.0])
+    found = transitions(replace(measured, episodes=[replace(episode, qpos=tilted)]), gym.make(TASK))
+    assert found["terminations"].tolist() == [0.0] * (len(found["actions"]) - 1) + [1.0]
+    assert np.abs(found["observations"][:, 1]).max() <= 0.2 < np.abs(found["next_observations"][-1, 1])
+    assert found["rewards"][-1] == 0
+
+
+def test_observations_are_those_of_the_corrected_environment() -> None:
+    env = gym.make("InvertedDoublePendulum-v5")
+    time = 0.01 * np.arange(100)
+    columns = {"time": time, "qpos.slider": 0.1 * np.sin(3 * time), "ctrl.slide": 0 * time}
+    columns |= {"qpos.hinge": 0 * time, "qpos.hinge2": 0.02 * np.cos(3 * time)}
+    measured = Measurements.from_tables({"log": columns})
+    plain = transitions(measured, env)
+    rubbed = transitions(measured, env, [LIBRARY["coulomb_friction"]("slider", level=2.0)])
+    assert not plain["observations"][:, 8].any()  # the force on the slider
+    assert np.abs(rubbed["observations"][:, 8]).max() == pytest.approx(2.0)
+    shown = transitions(measured, env, [LIBRARY["sensor_bias"]("hinge2", offset=0.03)])
+    np.testing.assert_allclose(shown["observations"][:, 2], plain["observations"][:, 2], atol=1e-9)  # as measured
+
+
+def test_observation_wrappers_are_applied() -> None:
+    env = gym.make(TASK)
+    twice = gym.wrappers.TransformObservation(env, lambda o: 2 * o, env.observation_space)
+    measured = log(episodes=1)
+    found = transitions(measured, twice, reward_fn=lambda o, a, n: n[:, 0])
+    np.testing.assert_allclose(found["observations"], 2 * transitions(measured, env)["observations"])
+    np.testing.assert_allclose(found["rewards"], found["next_observations"][:, 0])
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("env", "said"),
+    [
+        ("InvertedDoublePendulum-v5", r"the model's joint 'hinge2' has no column 'qpos.hinge2'"),
+        ("Reacher-v5", r"column 'qpos.slider': the model has no joint 'slider'"),
+        ("Pendulum-v1", r"target_data: the joints of Measurements.*pass a replay buffer"),
+    ],
+)
+def test_a_log_of_another_machine_is_refused(env: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        model(log(), env=gym.make(env), dynamics="ensemble", declared=())
+
+
+def test_wrappers_that_a_log_does_not_tell_of_are_refused() -> None:
+    env = gym.make(TASK)
+    for wrapped, said in (
+        (gym.wrappers.FrameStackObservation(env, 2), "FrameStackObservation shows more than the state"),
+        (gym.wrappers.TimeAwareObservation(env), "TimeAwareObservation shows more"),
+        (gym.wrappers.RescaleAction(env, -1.0, 1.0), "RescaleAction changes actions, and target_data=Measurements"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            transitions(log(episodes=1), wrapped)
+
+
+def test_unknown_rewards_are_not_made_up() -> None:
+    env = gym.wrappers.TransformReward(gym.make(TASK), lambda r: r)
+    with pytest.raises(ValueError, match=r"hold no rewards.*real_ratio=0"):
+        model(log(), env=env)
+    made = model(log(), env=env, real_ratio=0.0)
+    assert not chronological(made.replay_buffer.target)["rewards"].any()
+
+
+def test_a_log_of_other_motion_corrects_the_simulator_alone() -> None:
+    measured = log(episodes=1)
+    (episode,) = measured.episodes
+    fallen = replace(measured, episodes=[replace(episode, qpos=episode.qpos + np.array([0, 0.6]))])
+    with pytest.warns(UserWarning, match="learns there alone"):
+        assert model(fallen).replay_buffer.target.size() == 0
+    with pytest.raises(ValueError, match="record motion of the task"):
+        model(fallen, dynamics="ensemble", declared=())
+
+
+# --- learning ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    quick(monkeypatch)
+
+
+def quick(patch: pytest.MonkeyPatch) -> None:
+    """Few windows and long steps in time: a trace of some seconds."""
+    patch.setattr(closing, "FRESH", 50)
+    patch.setattr(windows, "LONGEST", 0.005)
+    patch.setattr(importlib.import_module("sb3_rpto.tracing.trace"), "FEW", 8)
+
+
+@cache
+def learned() -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        quick(patch)
+        return model(log(friction=True), close_loop=["coulomb_friction"]).learn(40, source_timesteps=20)
+
+
+def test_what_the_log_shows_joins_phi() -> None:
+    made = learned()
+    (report,) = made.loop.reports
+    assert report.verdict == "explained"
+    values = made.dynamics.describe()
+    assert values["coulomb_friction(slider).level"] == pytest.approx(LEVEL, rel=0.03)
+    assert values["hinge.damping"] == pytest.approx(DAMPING, rel=0.1)
+    assert "coulomb_friction(slider)" in [effect.label for effect in made._source_world.copies[0].effects]
+
+
+def test_source_steps_are_counted_and_old_ones_dropped() -> None:
+    made = learned()
+    assert made.num_timesteps == 40
+    assert 50 + 40 <= made.replay_buffer.source.size() < 50 + 40 + 8  # fresh ones, and those learned on
+
+
+def test_the_zip_holds_what_was_found_and_not_the_log(tmp_path: Path) -> None:
+    made = learned()
+    made.save(tmp_path / "model")
+    made.save_replay_buffer(tmp_path / "buffer")
+    loaded = RPTO.load(tmp_path / "model", env=gym.make(TASK), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert loaded.measured is None
+    assert loaded.dynamics.describe() == made.dynamics.describe()
+    loaded.learn(20, reset_num_timesteps=False)  # without another trace
+    assert loaded.num_timesteps == 60
+    assert len(loaded.loop.found) == 1
+
+
+def test_a_model_saved_before_its_trace_asks_for_the_log(tmp_path: Path) -> None:
+    model(log()).save(tmp_path / "model")
+    loaded = RPTO.load(tmp_path / "model", env=gym.make(TASK), device="cpu")
+    with pytest.raises(ValueError, match=r"set model\.measured"):
+        loaded.learn(20, source_timesteps=0)
+
+
+def test_with_the_loop_open_the_declared_numbers_alone_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    fits: list[int] = []
+    monkeypatch.setattr(PhysicalDynamics, "fit", lambda *_, **__: fits.append(1))
+    made = model(log(), RTO).learn(40, source_timesteps=0)
+    assert made.dynamics.names == ["hinge.damping"]
+    assert made.dynamics.values == pytest.approx(DAMPING, rel=0.05)
+    assert not made.loop.reports[0].effects
+    assert not fits
+
+
+def test_networks_learn_from_a_log(tmp_path: Path) -> None:
+    made = model(log(), dynamics="ensemble", declared=(), dynamics_kwargs=SMALL_ENSEMBLE)
+    size = made.replay_buffer.target.size()
+    assert size == 4 * 43
+    made.learn(40, source_timesteps=0)
+    assert made.loop is None
+    assert made.replay_buffer.target.size() == size
