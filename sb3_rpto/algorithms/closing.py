@@ -79,7 +79,7 @@ class LoopCloser:
         self._error = dynamics.error(data)
         _say(model, report, added, f"{len(data)} target transitions", before, self._error)
         if added:
-            renew_source(model)
+            renew_source(model, FRESH)
 
     def close_on_log(self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements) -> None:
         """Trace on a robot's log itself, by multiple shooting: one-step errors of noisy samples tell next to nothing.
@@ -96,10 +96,10 @@ class LoopCloser:
         _say(model, report, added, f"{len(measured.episodes)} recorded episodes", before, dynamics.error(data))
 
     def renew(self, model: TransferAlgorithm) -> None:
-        """Drop what is :attr:`stale`, if anything is."""
+        """Drop what is :attr:`stale`, if anything is; a budget of source steps is for the loop to learn on."""
         if self.stale:
             self.stale = False
-            renew_source(model)
+            renew_source(model, FILL)
 
     def _trace(
         self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements, horizon: float | None
@@ -176,14 +176,17 @@ def stays_finite(dynamics: PhysicalDynamics, data: Transitions) -> bool:
     return dynamics.runs(data, first, min(TRIAL_STEPS, len(data)))
 
 
-def renew_source(model: TransferAlgorithm) -> None:
-    """Drop what an uncorrected source produced, and learn in the corrected one before the next target step."""
+def renew_source(model: TransferAlgorithm, n_steps: int) -> None:
+    """Drop what an uncorrected source produced, and learn in the corrected one before learning goes on.
+
+    :param n_steps: to take there; after the first :data:`FILL` of them with their updates
+    """
     source = model._source_world
     assert source is not None
     model.replay_buffer.source.reset()
-    steps = source.interact(model, min(FILL, FRESH))
+    steps = source.interact(model, min(FILL, n_steps))
     updates_per_step = max(model.gradient_steps, 1) / int(model.source_steps)
-    while steps < FRESH:
+    while steps < n_steps:
         taken = source.interact(model, int(model.source_steps))
         model.train(round(taken * updates_per_step), model.batch_size)
         steps += taken

@@ -26,8 +26,8 @@ from sb3_rpto.tracing import Measurements, windows
 TASK, DT = "InvertedPendulum-v5", 0.04
 RATE, EVERY = 0.01, 4  # s between samples, samples between decisions
 GAINS = np.array([-0.741, -6.023, -0.868, -1.012])  # balance the pole
-DAMPING, LEVEL = 1.4, 12.0
-FRICTION = LIBRARY["coulomb_friction"]("slider", level=LEVEL)
+DAMPING, OFFSET = 1.4, 8.0
+PUSH = LIBRARY["torque_offset"]("slider", offset=OFFSET)
 
 
 def robot(lacks: tuple[Effect, ...] = ()) -> gym.Env:
@@ -39,9 +39,9 @@ def robot(lacks: tuple[Effect, ...] = ()) -> gym.Env:
 
 
 @cache
-def table(friction: bool = False, noise: float = 3e-4, episodes: int = 4, decisions: int = 45) -> dict[str, np.ndarray]:
+def table(pushed: bool = False, noise: float = 3e-4, episodes: int = 5, decisions: int = 28) -> dict[str, np.ndarray]:
     """The columns of a log, and the true velocities in ``true``; the robot is balanced and pushed about."""
-    env = robot((FRICTION,) if friction else ())
+    env = robot((PUSH,) if pushed else ())
     data: Any = env.unwrapped.data  # type: ignore[attr-defined]
     rng = np.random.default_rng(0)
     rows = []
@@ -121,13 +121,13 @@ def test_steps_end_between_samples_too() -> None:
 
 
 def test_no_step_spans_what_was_not_measured() -> None:
-    rows = np.delete(np.arange(181), np.arange(60, 80))
+    rows = np.delete(np.arange(113), np.arange(50, 70))
     whole, gap = transitions(log(episodes=1), gym.make(TASK)), transitions(log(rows, episodes=1), gym.make(TASK))
     assert len(whole["actions"]) - len(gap["actions"]) in range(5, 9)
     measured = log(episodes=1)
     (episode,) = measured.episodes
     off = episode.enabled.copy()
-    off[90] = False
+    off[60] = False
     lost = transitions(replace(measured, episodes=[replace(episode, enabled=off)]), gym.make(TASK))
     assert len(whole["actions"]) - len(lost["actions"]) in range(2, 5)  # with those whose smoothing reaches there
 
@@ -135,7 +135,7 @@ def test_no_step_spans_what_was_not_measured() -> None:
 def test_steps_after_the_end_of_the_task_are_left_out() -> None:
     measured = log(episodes=1)
     (episode,) = measured.episodes
-    tilted = episode.qpos + np.outer(np.maximum(0, episode.time - 1.0), [0, 1.0])
+    tilted = episode.qpos + np.outer(np.maximum(0, episode.time - 0.6), [0, 1.0])
     found = transitions(replace(measured, episodes=[replace(episode, qpos=tilted)]), gym.make(TASK))
     assert found["terminations"].tolist() == [0.0] * (len(found["actions"]) - 1) + [1.0]
     assert np.abs(found["observations"][:, 1]).max() <= 0.2 < np.abs(found["next_observations"][-1, 1])
@@ -220,7 +220,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def quick(patch: pytest.MonkeyPatch) -> None:
     """Few windows and long steps in time: a trace of some seconds."""
-    patch.setattr(closing, "FRESH", 50)
+    patch.setattr(closing, "FILL", 50)
     patch.setattr(windows, "LONGEST", 0.005)
     patch.setattr(importlib.import_module("sb3_rpto.tracing.trace"), "FEW", 8)
 
@@ -229,7 +229,7 @@ def quick(patch: pytest.MonkeyPatch) -> None:
 def learned() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         quick(patch)
-        return model(log(friction=True), close_loop=["coulomb_friction"]).learn(40, source_timesteps=20)
+        return model(log(pushed=True), close_loop=["torque_offset"]).learn(40, source_timesteps=20)
 
 
 def test_what_the_log_shows_joins_phi() -> None:
@@ -237,9 +237,9 @@ def test_what_the_log_shows_joins_phi() -> None:
     (report,) = made.loop.reports
     assert report.verdict == "explained"
     values = made.dynamics.describe()
-    assert values["coulomb_friction(slider).level"] == pytest.approx(LEVEL, rel=0.03)
+    assert values["torque_offset(slider).offset"] == pytest.approx(OFFSET, rel=0.03)
     assert values["hinge.damping"] == pytest.approx(DAMPING, rel=0.1)
-    assert "coulomb_friction(slider)" in [effect.label for effect in made._source_world.copies[0].effects]
+    assert "torque_offset(slider)" in [effect.label for effect in made._source_world.copies[0].effects]
 
 
 def test_source_steps_are_counted_and_old_ones_dropped() -> None:
@@ -281,7 +281,7 @@ def test_with_the_loop_open_the_declared_numbers_alone_are_fitted(monkeypatch: p
 def test_networks_learn_from_a_log(tmp_path: Path) -> None:
     made = model(log(), dynamics="ensemble", declared=(), dynamics_kwargs=SMALL_ENSEMBLE)
     size = made.replay_buffer.target.size()
-    assert size == 4 * 43
+    assert size == 5 * 26
     made.learn(40, source_timesteps=0)
     assert made.loop is None
     assert made.replay_buffer.target.size() == size
