@@ -18,10 +18,12 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto import RPTO
+from sb3_rpto.algorithms import closing
 from sb3_rpto.callbacks import RelativityGapCallback
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
 from sb3_rpto.effects import LIBRARY, declare, parameter_names
 from sb3_rpto.effects.carry import carried_by
+from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.presets import preset_names, resolve_preset
 
 ROOT = Path(__file__).parents[1]
@@ -103,7 +105,7 @@ class Succeeds(gym.Wrapper):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_every_logged_key_is_explained_and_every_explained_key_is_logged(tmp_path):
+def test_every_logged_key_is_explained_and_every_explained_key_is_logged(tmp_path, monkeypatch):
     keys: set[str] = set()
     for cls in ALGORITHMS:
         evaluation = EvalCallback(Monitor(Succeeds(pendulum(12.0))), eval_freq=210, n_eval_episodes=1, verbose=0)
@@ -113,8 +115,14 @@ def test_every_logged_key_is_explained_and_every_explained_key_is_logged(tmp_pat
     physical = {"dynamics": "physical", "declared": ["pole_length", "gravity"], "policy_kwargs": SMALL_POLICY}
     model = RPTO("MlpPolicy", cartpole, target_env=gym.make(cartpole, pole_length=2.0), gradient_steps=1, **physical)
     keys |= logged(model)
-    names = {"gravity", "pole_length"}
-    patterns = {key: re.escape(key).replace("<name>", f"({'|'.join(names)})") for key in explained()}
+    monkeypatch.setattr(closing, "FIRST", 80)
+    monkeypatch.setattr(closing, "FRESH", 50)
+    double = "InvertedDoublePendulum-v5"
+    target = apply_effects(gym.make(double), [LIBRARY["coulomb_friction"]("slider", level=5.0)])
+    settings = {"declared": ["pole.length"], "close_loop": ["coulomb_friction"], "model_train_freq": 40}
+    keys |= logged(small(RPTO, gym.make(double), target, dynamics="physical", weighting=None, **settings))
+    names = {"gravity", "pole_length", "pole.length", "coulomb_friction(slider).level"}
+    patterns = {key: re.escape(key).replace("<name>", f"({'|'.join(map(re.escape, names))})") for key in explained()}
     assert {key for key in keys if not any(re.fullmatch(p, key) for p in patterns.values())} == set()
     assert {key for key, p in patterns.items() if not any(re.fullmatch(p, k) for k in keys)} == set()
 
@@ -124,7 +132,9 @@ def test_the_preset_table_is_the_files():
     lines = re.findall(rf"^\| ((?:preset|{'|'.join(preset_names())}) \|.*)\|$", text, re.MULTILINE)
     header, *rows = [[cell.strip() for cell in line.split("|")] for line in lines]
     assert header[:2] == ["preset", "backend"]
-    assert [row[:2] for row in rows] == [list(p) for p in product(preset_names(), ["real", "ensemble", "physical"])]
+    assert [row[:2] for row in rows] == [
+        list(p) for p in product(preset_names(), ["real", "ensemble", "physical", "mujoco", "residual"])
+    ]
     for preset, backend, *cells in rows:
         values = resolve_preset(preset, backend, None, ())
         values |= values.pop("dynamics_kwargs", {})

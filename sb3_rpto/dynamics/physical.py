@@ -218,7 +218,7 @@ class PhysicalDynamics(Dynamics):
     def describe(self) -> dict[str, float]:
         """phi by name, with the standard deviations."""
         values = dict(zip(self.names, map(float, self.values)))
-        return values | {f"{name}_std": float(d) for name, d in zip(self.names, self.deviation)}
+        return values | {f"{name}_se": float(d) for name, d in zip(self.names, self.deviation)}
 
     # ------------------------------------------------------------------ prediction
 

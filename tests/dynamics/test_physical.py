@@ -236,7 +236,7 @@ def test_the_deviation_shrinks_with_the_data():
     assert ((ratio > 1.3) & (ratio < 4)).all()
     assert model.describe() == {
         **dict(zip(SHIFTS[POLE], model.values)),
-        **{f"{name}_std": d for name, d in zip(SHIFTS[POLE], model.deviation)},
+        **{f"{name}_se": d for name, d in zip(SHIFTS[POLE], model.deviation)},
     }
 
 
