@@ -16,6 +16,7 @@ from torch.nn import functional as F
 
 from sb3_rpto.buffers import DualReplayBuffer, World, chronological
 from sb3_rpto.dynamics.base import Dynamics, Transitions
+from sb3_rpto.dynamics.products import fast_products
 from sb3_rpto.dynamics.weights import WeightingName, effective_sample_size, rto_weights
 
 #: The actor's batches alternate: four from D_target, then one from D_source (f = 5 in the paper's appendix).
@@ -69,29 +70,30 @@ class RelativeUpdate(SAC):
         self._update_learning_rate(optimizers)
         policy_learns = self.updates_policy or self._pretraining
         losses: dict[str, list[th.Tensor]] = {}
-        for gradient_step in range(gradient_steps):
-            critic_batch, actor_batch = self.sample_batches(batch_size)
-            step_losses: dict[str, th.Tensor] = {}
-            step_losses["ent_coef"] = ent_coef = self.temperature()
-            # The order is SAC's: the actor samples first, its loss then uses the updated critic.
-            if policy_learns:
-                if self.use_sde:
-                    self.actor.reset_noise()
-                actions_pi, log_prob = self.actor.action_log_prob(actor_batch.observations)
-                log_prob = log_prob.reshape(-1, 1)
-                if self.ent_coef_optimizer is not None:
-                    step_losses["ent_coef_loss"] = self.temperature_loss(log_prob)
-                    _descend(self.ent_coef_optimizer, step_losses["ent_coef_loss"])
-            step_losses["critic_loss"] = self.critic_loss(critic_batch, ent_coef)
-            _descend(self.critic.optimizer, step_losses["critic_loss"])
-            if policy_learns:
-                step_losses["actor_loss"] = self.actor_loss(actor_batch, actions_pi, log_prob, ent_coef)
-                _descend(self.actor.optimizer, step_losses["actor_loss"])
-            if gradient_step % self.target_update_interval == 0:
-                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
-            for name, loss in step_losses.items():
-                losses.setdefault(name, []).append(loss.detach().reshape(()))
+        with fast_products(self.device):
+            for gradient_step in range(gradient_steps):
+                critic_batch, actor_batch = self.sample_batches(batch_size)
+                step_losses: dict[str, th.Tensor] = {}
+                step_losses["ent_coef"] = ent_coef = self.temperature()
+                # The order is SAC's: the actor samples first, its loss then uses the updated critic.
+                if policy_learns:
+                    if self.use_sde:
+                        self.actor.reset_noise()
+                    actions_pi, log_prob = self.actor.action_log_prob(actor_batch.observations)
+                    log_prob = log_prob.reshape(-1, 1)
+                    if self.ent_coef_optimizer is not None:
+                        step_losses["ent_coef_loss"] = self.temperature_loss(log_prob)
+                        _descend(self.ent_coef_optimizer, step_losses["ent_coef_loss"])
+                step_losses["critic_loss"] = self.critic_loss(critic_batch, ent_coef)
+                _descend(self.critic.optimizer, step_losses["critic_loss"])
+                if policy_learns:
+                    step_losses["actor_loss"] = self.actor_loss(actor_batch, actions_pi, log_prob, ent_coef)
+                    _descend(self.actor.optimizer, step_losses["actor_loss"])
+                if gradient_step % self.target_update_interval == 0:
+                    polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+                    polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+                for name, loss in step_losses.items():
+                    losses.setdefault(name, []).append(loss.detach().reshape(()))
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in losses.items():  # read here at once: reading each would wait for the device every step

@@ -1,0 +1,66 @@
+"""Matrix products of the CPU: chosen by a probe, restored for the user."""
+
+import pytest
+import torch as th
+
+from sb3_rpto.dynamics import products
+from sb3_rpto.dynamics.products import fast_products, pays
+
+
+@pytest.fixture(autouse=True)
+def restored():
+    before = th.get_float32_matmul_precision()
+    yield
+    th.set_float32_matmul_precision(before)
+
+
+@pytest.mark.parametrize(("faster", "inside"), [(True, "medium"), (False, "highest")])
+def test_the_probe_decides_and_the_setting_comes_back(monkeypatch, faster, inside):
+    monkeypatch.setattr(products, "pays", lambda: faster)
+    with fast_products():
+        assert th.get_float32_matmul_precision() == inside
+    assert th.get_float32_matmul_precision() == "highest"
+
+
+def test_the_setting_comes_back_after_an_error(monkeypatch):
+    monkeypatch.setattr(products, "pays", lambda: True)
+    with pytest.raises(KeyError), fast_products():
+        raise KeyError
+    assert th.get_float32_matmul_precision() == "highest"
+
+
+def test_what_the_user_chose_stays(monkeypatch):
+    monkeypatch.setattr(products, "pays", lambda: True)
+    th.set_float32_matmul_precision("high")
+    with fast_products():
+        assert th.get_float32_matmul_precision() == "high"
+
+
+def test_other_devices_are_left_alone(monkeypatch):
+    monkeypatch.setattr(products, "pays", lambda: True)
+    with fast_products("meta"):
+        assert th.get_float32_matmul_precision() == "highest"
+
+
+def test_the_probe_leaves_the_setting_and_refuses_what_is_inaccurate(monkeypatch):
+    pays.cache_clear()
+    monkeypatch.setattr(products, "ACCURATE", 0.0)
+    assert not pays()
+    assert th.get_float32_matmul_precision() == "highest"
+    pays.cache_clear()
+
+
+def test_the_probe_refuses_what_is_not_faster(monkeypatch):
+    pays.cache_clear()
+    monkeypatch.setattr(products, "_fastest", lambda *_: 1.0)
+    assert not pays()
+    monkeypatch.undo()
+    pays.cache_clear()
+
+
+def test_chosen_products_are_float32():
+    generator = th.Generator().manual_seed(1)
+    a, b = th.randn(64, 300, generator=generator), th.randn(300, 50, generator=generator)
+    with fast_products():
+        product = a @ b
+    th.testing.assert_close(product.double(), a.double() @ b.double(), rtol=1e-4, atol=1e-4)
