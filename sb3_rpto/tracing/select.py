@@ -30,8 +30,9 @@ FOLDS = 6
 SEEMS = 1.5
 #: Rounds of the look forward, and candidates fitted in each.
 ROUNDS, PROMISING = 3, 4
-#: Pairs of kept effects in whose place one is tried.
-MERGES = 3
+#: Pairs of kept effects in whose place one is tried, and the typical window error, in units of the noise, up to which
+#: that is worth its time: where much is missing, neither the two nor the one are right.
+MERGES, MERGEABLE = 3, 2.0
 #: Typical window error, in units of the noise, that leaves nothing to look forward to.
 ENOUGH = 1.1
 #: Candidates for a substitution are the likest so many, of at least this cosine.
@@ -308,6 +309,8 @@ class Selector:
     def merge(self, selection: Selection, screening: Screening) -> Selection:
         """Try one effect in the place of two: the joint fit may have met its like by a mixture."""
         current = selection.model
+        if np.median(current.errors) > MERGEABLE:
+            return selection
         pairs = sorted(combinations(current.effects, 2), key=lambda pair: -screening.cosine[pair])[:MERGES]
         for pair in pairs:
             rest = [e for e in current.effects if e not in pair]
