@@ -8,22 +8,28 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from stable_baselines3 import SAC
 
 from sb3_rpto.effects.carry import load_corrected
-from sb3_rpto.tracing import Measurements
+from sb3_rpto.tracing import Measurements, windows
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SMALL = ["--episodes", "6", "--duration", "2.5"]
 
 
-@pytest.fixture
-def trace_robot(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("trace_robot", EXAMPLES / "trace_robot.py")
+def load(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "trace_robot", module)
+    monkeypatch.setitem(sys.modules, name, module)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture
+def trace_robot(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    return load("trace_robot", monkeypatch)
 
 
 def run(module: ModuleType, monkeypatch: pytest.MonkeyPatch, out: Path, *arguments: str) -> None:
@@ -74,6 +80,32 @@ def test_trace_robot_draws_by_seed(trace_robot):
     assert len(set(robots)) > 12
     assert all(known for _, known in robots)
     assert not any(inside(seed, False)[1] for seed in range(5))
+
+
+def test_robot_log_to_policy_goes_from_a_log_to_a_policy(monkeypatch, tmp_path, capsys):
+    example = load("robot_log_to_policy", monkeypatch)
+    monkeypatch.setattr(windows, "LONGEST", 0.005)
+    monkeypatch.setattr(importlib.import_module("sb3_rpto.tracing.trace"), "FEW", 12)
+    monkeypatch.setattr(sys, "argv", ["robot_log_to_policy.py", "--quick", "--out", str(tmp_path)])
+    example.main()
+    header = "time,qpos.slider,qpos.hinge,qpos.hinge2,qvel.slider,qvel.hinge,qvel.hinge2,ctrl.slide"
+    assert {file.read_text().splitlines()[0] for file in (tmp_path / "log").iterdir()} == {header}
+    assert len(list((tmp_path / "log").iterdir())) == 8
+    length, secret = example.Robot(0)._inside
+    found = {e.label: e.values for e in load_corrected(tmp_path).effects}
+    assert found["pole.length"] == pytest.approx(length.values, rel=0.03)
+    assert found[secret.label] == pytest.approx(secret.values, rel=0.25)
+    assert SAC.load(tmp_path / "sac.zip", device="cpu").observation_space.shape == (9,)
+    out = capsys.readouterr().out
+    assert out.index("verdict:") < out.index("policy of the corrected simulator") < out.index("in the robot:")
+
+
+def test_robot_log_to_policy_draws_by_seed(monkeypatch):
+    robot = load("robot_log_to_policy", monkeypatch).Robot
+    drawn = [robot(seed).truth() for seed in range(12)]
+    assert drawn == [robot(seed).truth() for seed in range(12)]
+    assert len(set(drawn)) == 12
+    assert len({robot(seed)._inside[1].label for seed in range(12)}) == 3
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py")))
