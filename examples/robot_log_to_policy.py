@@ -38,7 +38,7 @@ NOISE = {"qpos": 1e-3, "qvel": 0.02}  # of the encoders, in m or rad, and m/s or
 #: One of these is in the robot: kind, place, parameter, and the range that its value is drawn from.
 SECRETS = (
     ("actuator_lag", "slide", "time_constant", (0.027, 0.035)),
-    ("command_delay", "slide", "delay", (0.02, 0.03)),
+    ("command_delay", "slide", "delay", (0.015, 0.022)),
     ("torque_offset", "hinge", "offset", (0.8, 1.2)),
 )
 COLUMNS = ["time", *(f"{what}.{joint}" for what in NOISE for joint in ("slider", "hinge", "hinge2")), "ctrl.slide"]
@@ -49,7 +49,7 @@ class Robot:
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
-        kind, place, parameter, bounds = SECRETS[rng.integers(len(SECRETS))]
+        kind, place, parameter, bounds = SECRETS[seed % len(SECRETS)]
         (pole,) = declare(gym.make(TASK).unwrapped.model, DECLARED)
         unknown = LIBRARY[kind](place, **{parameter: rng.uniform(*bounds)})
         self._inside: list[Effect] = [pole.with_values(rng.uniform(1.08, 1.2) * pole.values), unknown]
@@ -66,7 +66,7 @@ class Robot:
 
 def source_policy(folder: Path, steps: int) -> Path:
     """A SAC that balances in the simulator; trained once."""
-    path = folder / "source.zip"
+    path = folder / f"source_{steps}.zip"
     if not path.exists():
         print("training a policy in the simulator (once)")
         model = SAC("MlpPolicy", gym.make(TASK), seed=0, device="cpu")
@@ -172,7 +172,7 @@ def main() -> None:
     if arguments.quick:
         arguments.steps = arguments.source_steps = 200
         arguments.attempts, arguments.episodes = 8, 2
-        kinds = ["torque_offset", "command_delay"]
+        kinds = ["actuator_lag", "torque_offset"]
     out.mkdir(parents=True, exist_ok=True)
     th.set_num_threads(1)  # more are no quicker for networks of this size
     source = source_policy(out, arguments.source_steps)
