@@ -2,9 +2,11 @@ r"""The length of a link: its capsules and the offsets of its children.
 
 A link is stretched along the axis :math:`n` of its longest capsule, by the map
 :math:`x' = x + (s - 1)(n \cdot x)\,n` of points in the body's frame. The ends of its capsules, the centres of its other
-geoms, its sites, its joints' anchors and the origins of its children move by it; radii, the other geoms' sizes and the
-children themselves stay. The body is put where its first joint's anchor stays in the parent, so that the joint still
-joins. The density stays: the body's mass is spread over its primitive geoms by their volume (meshes count as shown
+geoms, its sites, its joints' anchors and the points where its children are joined to it move by it; radii, the other
+geoms' sizes and the children themselves stay. A body is joined to its parent where it turns, at the anchor of its first
+hinge or ball, else at its origin; the stretched body is put where that point stays in its parent. So the distance
+between two joints grows by :math:`s`, and a link that slides on rails, such as a walker's torso, stays where it is.
+The density stays: the body's mass is spread over its primitive geoms by their volume (meshes count as shown
 only), and what the stretched ones gain is added to mass, centre and inertia. That is exact for bodies whose inertia
 follows from their geoms at one density, as a recompiled model would have it.
 """
@@ -16,6 +18,7 @@ from sb3_rpto.effects.inertia import from_tensor, matrices, to_tensor
 from sb3_rpto.effects.world import World
 
 _CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+_TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
 _VOLUMES = {
     _CAPSULE: lambda s: np.pi * s[:, 0] ** 2 * (2 * s[:, 1] + 4 / 3 * s[:, 0]),
     int(mujoco.mjtGeom.mjGEOM_SPHERE): lambda s: 4 / 3 * np.pi * s[:, 0] ** 3,
@@ -77,11 +80,14 @@ class _Link:
         for name, count, owner in (
             ("jnt_pos", model.njnt, model.jnt_bodyid),
             ("site_pos", model.nsite, model.site_bodyid),
-            ("body_pos", model.nbody, model.body_parentid),
         ):
             for i in range(count):
                 if owner[i] == body:
                     self.put(name, i, self.moved(self.get(name, i)))
+        for child in np.flatnonzero(model.body_parentid == body):
+            if child:  # the world is its own parent
+                arm = self.arm(child, self.anchor(child))
+                self.put("body_pos", child, self.moved(self.get("body_pos", child) + arm) - arm)
 
     def stretch_geom(self, g: int) -> None:
         """Move a geom, and lengthen and turn a capsule."""
@@ -95,12 +101,24 @@ class _Link:
         self.put("geom_quat", g, _turned(quat, half / size[:, 1:2]))
 
     def keep_joint(self) -> None:
-        """Move the body so that its first joint's anchor stays where it is in the parent."""
+        """Move the body so that it is joined to its parent where it was."""
+        anchor = self.anchor(self.body)
+        self.put(
+            "body_pos", self.body, self.get("body_pos", self.body) + self.arm(self.body, anchor - self.moved(anchor))
+        )
+
+    def anchor(self, body: int) -> np.ndarray:
+        """Where a body turns, in its own frame (n, 3): the anchor of its first hinge or ball, else its origin."""
         model = self.world.model
-        if model.body_jntnum[self.body]:
-            anchor = self.get("jnt_pos", model.body_jntadr[self.body])
-            shift = matrices(self.get("body_quat", self.body)) @ (anchor - self.moved(anchor))[:, :, None]
-            self.put("body_pos", self.body, self.get("body_pos", self.body) + shift[:, :, 0])
+        first = int(model.body_jntadr[body])
+        for joint in range(first, first + int(model.body_jntnum[body])):
+            if model.jnt_type[joint] in _TURNING:
+                return self.get("jnt_pos", joint)
+        return np.zeros((len(self.rows), 3))
+
+    def arm(self, body: int, offset: np.ndarray) -> np.ndarray:
+        """A vector of a body's frame in its parent's, (n, 3)."""
+        return (matrices(self.get("body_quat", body)) @ offset[:, :, None])[:, :, 0]
 
     def moments(self, g: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         r"""Volume (n,), :math:`\int x\,dV` (n, 3) and :math:`\int x x^T dV` (n, 3, 3) of a geom.

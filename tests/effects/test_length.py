@@ -1,5 +1,6 @@
 """Stretched links equal recompiled ones."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import gymnasium
@@ -10,7 +11,7 @@ import pytest
 from sb3_rpto.effects import LIBRARY, Declared
 from sb3_rpto.effects.inertia import from_tensor, matrices, to_tensor
 from sb3_rpto.effects.length import link_length, write_length
-from sb3_rpto.effects.world import BatchWorld
+from sb3_rpto.effects.world import BatchWorld, LiveWorld
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -41,10 +42,18 @@ def recompiled(path: Path, name: str, scale: float) -> tuple[mujoco.MjModel, muj
         half = model.geom_size[g, 1] * axes[g]
         geom.fromto = [*(stretch @ (model.geom_pos[g] - half)), *(stretch @ (model.geom_pos[g] + half))]
         geom.pos, geom.quat = [0, 0, 0], [1, 0, 0, 0]
-    anchor = model.jnt_pos[model.body_jntadr[body]]
-    link.pos = link.pos + matrices(model.body_quat[body][None])[0] @ (anchor - stretch @ anchor)
-    for thing in (*link.joints, *link.bodies, *link.sites):
+
+    def joined(body: mujoco.MjsBody) -> np.ndarray:
+        """From a body's origin to where it turns, in its parent's frame."""
+        turning = [j.pos for j in body.joints if j.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL)]
+        return matrices(model.body_quat[model.body(body.id).id][None])[0] @ turning[0] if turning else np.zeros(3)
+
+    for child in link.bodies:
+        child.pos = stretch @ (child.pos + joined(child)) - joined(child)
+    rotation, before = matrices(model.body_quat[body][None])[0], joined(link)
+    for thing in (*link.joints, *link.sites):
         thing.pos = stretch @ thing.pos
+    link.pos = link.pos + before - rotation @ stretch @ rotation.T @ before
     return model, spec.compile()
 
 
@@ -79,6 +88,30 @@ def test_stretched_equals_recompiled(file: str, name: str, scale: float) -> None
         for output, values in outputs.items():
             # Contacts amplify rounding.
             np.testing.assert_allclose(values[1], getattr(data, output), rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.2])
+def test_distances_between_joints_are_scaled(scale: float) -> None:
+    """Hopper's bodies have their origins away from their joints, and its torso slides on rails 1.25 m below it."""
+    model = mujoco.MjModel.from_xml_path(str(ASSETS / "hopper.xml"))
+    before, data = mujoco.MjData(model), mujoco.MjData(model)
+    mujoco.mj_forward(model, before)
+    world = LiveWorld(model, data)
+    for name in ("torso", "thigh", "leg", "foot"):
+        nominal = link_length(model, model.body(name).id)
+        write_length(world, model.body(name).id, np.array([scale * nominal]), nominal)
+    world.settle()
+    mujoco.mj_forward(model, data)
+    joints = [model.joint(name).id for name in ("rooty", "thigh_joint", "leg_joint", "foot_joint")]
+    for one, next_one in pairwise(joints):
+        np.testing.assert_allclose(
+            data.xanchor[next_one] - data.xanchor[one],
+            scale * (before.xanchor[next_one] - before.xanchor[one]),
+            atol=1e-12,
+        )
+    np.testing.assert_array_equal(data.body("torso").xpos, before.body("torso").xpos)
+    sole = data.geom("foot_geom").xpos - data.xanchor[joints[-1]]
+    np.testing.assert_allclose(sole, (before.geom("foot_geom").xpos - before.xanchor[joints[-1]]) * (scale, 1, 1))
 
 
 def test_inertia_of_offset_balls_and_boxes() -> None:
