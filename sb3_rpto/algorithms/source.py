@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_nor
 
 from sb3_rpto.algorithms.update import RelativeUpdate
 from sb3_rpto.algorithms.worlds import check_finite, share_normalisation
-from sb3_rpto.dynamics.base import Dynamics
+from sb3_rpto.dynamics.base import Dynamics, Prediction
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
@@ -239,13 +239,21 @@ class BranchSource(SourceWorld):
         with th.no_grad():
             scaled = model.actor(th.as_tensor(seen, device=model.device).float(), deterministic=False)
         actions = model.unscale_actions(scaled)
-        answer = self.dynamics.step(th.as_tensor(starts, device=model.device), actions, deterministic=False)
+        answer = self.answer(model, th.as_tensor(starts, device=model.device), actions)
         next_obs, rewards = answer.next_observations.cpu().numpy(), answer.rewards.cpu().numpy()
         check_finite("modelled source", observation=next_obs, reward=rewards)
         next_obs = next_obs.clip(model.observation_space.low, model.observation_space.high)
         terminations = answer.terminations.cpu().numpy()
         model.replay_buffer.append("source", starts, next_obs, scaled.cpu().numpy(), rewards, terminations)
         return n_steps
+
+    def answer(self, model: RelativeUpdate, observations: th.Tensor, actions: th.Tensor) -> Prediction:
+        """What follows each branch's observation (n, observation_dim) and action (n, action_dim), in their units."""
+        return self.dynamics.step(observations, actions, deterministic=False)
+
+    def target_rows(self, model: RelativeUpdate, n: int) -> np.ndarray:
+        """Rows of D_target to branch from, (n,)."""
+        return np.random.randint(model.replay_buffer.target.size(), size=n)
 
     def _starts(self, model: RelativeUpdate, n: int) -> np.ndarray:
         """Observations to branch from, (n, observation_dim), raw."""
@@ -255,8 +263,7 @@ class BranchSource(SourceWorld):
             n_target = 0  # before the first target transition only the source has states
         pools = []
         if n_target > 0:
-            rows = np.random.randint(buffer.target.size(), size=n_target)
-            pools.append(buffer.target.observations[rows, 0])
+            pools.append(buffer.target.observations[self.target_rows(model, n_target), 0])
         if n > n_target:
             rows = np.random.randint(len(buffer.source_starts), size=n - n_target)
             pools.append(buffer.source_starts[rows])

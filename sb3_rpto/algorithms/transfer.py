@@ -21,9 +21,10 @@ from sb3_rpto.algorithms import arguments, checkpoint, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.algorithms.closing import LoopCloser
-from sb3_rpto.algorithms.source import RolloutStart, make_source_world
+from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_world
 from sb3_rpto.algorithms.worlds import check_seedable, check_spaces, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
+from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.weights import WeightingName
@@ -272,10 +273,18 @@ class TransferAlgorithm(Resumable):
         super()._setup_model()
         self.replay_buffer_class, self.replay_buffer_kwargs = side_class, kwargs
         if self.dynamics_config is not None:
-            dynamics = make_dynamics(self.dynamics_config, self.observation_space, self.action_space)
-            self.dynamics = dynamics.to(self.device)
+            self.dynamics = self._make_dynamics(self.dynamics_config).to(self.device)
             if self.seed is not None:
                 self.dynamics.seed(self.seed + DYNAMICS_SEED_OFFSET)
+
+    def _make_dynamics(self, config: dict[str, Any]) -> Dynamics:
+        """The trainable source that :func:`~sb3_rpto.dynamics.factory.dynamics_config` describes."""
+        return make_dynamics(config, self.observation_space, self.action_space)
+
+    def _make_source_world(self) -> SourceWorld:
+        """The world that step 3 acts in."""
+        assert self.env is not None  # learn() has checked
+        return make_source_world(self.env, self.dynamics, self.rollout_start, int(self.source_steps))
 
     @classmethod
     def from_source(
@@ -338,12 +347,9 @@ class TransferAlgorithm(Resumable):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
-        assert self.env is not None  # check_ready has seen it
-        self._source_world = self._source_world or make_source_world(
-            self.env, self.dynamics, self.rollout_start, int(self.source_steps)
-        )
+        self._source_world = self._source_world or self._make_source_world()
         self._trace_log()  # first of all: the log may be refused
-        warm.begin_in_source(self, source_timesteps, progress_bar)
+        self.begin_in_source(source_timesteps, progress_bar)
         inside_rollout = checkpoint.resume(self)
         if self.loop is not None:
             self.loop.renew(self)
@@ -361,6 +367,14 @@ class TransferAlgorithm(Resumable):
         callback.on_training_end()
         self._callback = None
         return self
+
+    def begin_in_source(self, source_timesteps: int, progress_bar: bool) -> None:
+        """What Algorithm 1 takes as its input: a policy, its critic and phi_0 that know the source.
+
+        :param source_timesteps: source steps that train a model which knows nothing of the source
+        :param progress_bar: show a bar for them
+        """
+        warm.begin_in_source(self, source_timesteps, progress_bar)
 
     def interact_with_source(self) -> None:
         """Step 3: act in the source P_phi, ``source_steps`` times for each target step, and fill D_source."""
