@@ -23,7 +23,7 @@ from sb3_rpto.effects.model import ModelSource, load_model, numbers, same_layout
 from sb3_rpto.effects.names import near
 from sb3_rpto.effects.simulation import Simulation, prepare
 from sb3_rpto.effects.world import LiveWorld
-from sb3_rpto.effects.wrapper import CorrectedEnv, active, is_corrected, own
+from sb3_rpto.effects.wrapper import CorrectedEnv, active, own
 
 FORMAT = 1
 _HOOKS = ("act", "command", "observe")
@@ -83,11 +83,9 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
         :func:`load_corrected` refuses
     :param source: the nominal model, see :func:`~sb3_rpto.effects.model.load_model`; not an MjModel alone
     :param effects: with their values
-    :raises ValueError: nothing tells the MJCF of ``source``, or it has effects already
+    :raises ValueError: nothing tells the MJCF of ``source``, or it has effects that are no numbers of its model
     :raises FileNotFoundError: an asset is missing
     """
-    if isinstance(source, gym.Env) and is_corrected(source):
-        raise ValueError("source has effects already; give the nominal model, or the environment as it was before")
     spec, nominal = load_model(source)
     if spec is None:
         raise ValueError(

@@ -12,6 +12,8 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.wrapper import beyond_model
+
 #: what :func:`load_model` takes
 ModelSource: TypeAlias = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | gym.Env
 
@@ -20,12 +22,13 @@ def load_model(source: ModelSource) -> tuple[mujoco.MjSpec | None, mujoco.MjMode
     """The compiled model that ``source`` holds, and the specification that it came from.
 
     :param source: the path of an MJCF file, MJCF text, an MjSpec, an MjModel, or a gymnasium MuJoCo environment, whose
-        model may have been changed since it was loaded
+        model may have been changed since it was loaded. One whose MJCF is in no file tells it by a method ``mjcf()``
     :return: a specification (None where nothing tells it: for an MjModel, and for an environment whose file compiles to
         a model of another layout) and a model; copies, the source is left alone
     :raises TypeError: none of these
     :raises FileNotFoundError: there is no such file
-    :raises ValueError: the MJCF does not compile; an environment without a MuJoCo model
+    :raises ValueError: the MJCF does not compile; an environment without a MuJoCo model, or with effects in it that are
+        no numbers of the model
     """
     if isinstance(source, mujoco.MjModel):
         return None, copy.copy(source)
@@ -60,10 +63,19 @@ def _from_env(env: gym.Env) -> tuple[mujoco.MjSpec | None, mujoco.MjModel]:
     model = getattr(base, "model", None)
     if not isinstance(model, mujoco.MjModel):
         raise ValueError(f"{type(base).__name__} has no MuJoCo model (env.unwrapped.model); give the MJCF itself")
-    path = getattr(base, "fullpath", None)
-    if path is None or not Path(path).is_file():
-        return None, copy.copy(model)
-    spec, compiled = load_model(path)
+    beyond = beyond_model(env)
+    if beyond:
+        raise ValueError(
+            f"env has effects already that are no numbers of its model ({', '.join(beyond)}); give the environment as "
+            "it was before them"
+        )
+    if callable(getattr(base, "mjcf", None)):
+        spec, compiled = load_model(base.mjcf())
+    else:
+        path = getattr(base, "fullpath", None)
+        if path is None or not Path(path).is_file():
+            return None, copy.copy(model)
+        spec, compiled = load_model(path)
     return (spec if same_layout(compiled, model) else None), copy.copy(model)
 
 

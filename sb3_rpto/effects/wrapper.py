@@ -54,9 +54,12 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
     act in every substep, sensors in every observation; rewards and terminations that a task computes from its state see
     the true state. Without effects every step is the wrapped environment's, bit for bit.
 
+    They come on top of the effects that ``env`` has already: numbers change from where those left them, forces add up,
+    commands reach those after these, and these observe what those show.
+
     :param env: one whose innermost environment has MuJoCo's ``model`` and ``data`` and steps them by ``do_simulation``
     :param effects: those of the model's own numbers, forces, commands and sensors, with their values
-    :raises ValueError: no MuJoCo environment, or one that has effects already; an effect on an object not in the model
+    :raises ValueError: no MuJoCo environment; an effect on an object not in the model
     """
 
     #: what changes after it is made, for :func:`sb3_rpto.envs.state.save_state`
@@ -70,7 +73,16 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         self.effects: list[Effect] = []
         self._commanding: list[tuple[Effect, np.ndarray]] = []
         self._memory: list[dict[str, Any]] = []
+        self._sensing: list[tuple[Effect, np.ndarray]] = []
+        self._acting: list[tuple[Effect, np.ndarray]] = []
+        beneath = corrections(env)
+        self._covered = False
+        # What the environment was seen to use, and must: one for all, since the outermost simulates for the others.
+        self._called: set[str] = beneath[0]._called if beneath else set()
+        self._wanted: set[str] = set()
         self.set_effects(effects)
+        for layer in beneath[:1]:
+            layer._covered = True
 
     def set_effects(self, effects: Sequence[Effect]) -> None:
         """Have these effects instead of the ones before; the simulation goes on from where it is.
@@ -79,8 +91,10 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
 
         :param effects: with their values, those of declared parameters too: what is not among them is nominal again
         :raises ValueError: an effect on an object that is not in the model, or on sensors that are read elsewhere than
-            in ``_get_obs``; nothing is changed then
+            in ``_get_obs``, or other effects came on top of these; nothing is changed then
         """
+        if self._covered:
+            raise ValueError("other effects came on top of these; set those, or begin from an environment without")
         base: Any = self.unwrapped
         sensing = [effect.label for effect, _ in active(own(effects, base.model)) if effect.overrides("observe")]
         if sensing and not callable(getattr(base, "_get_obs", None)):
@@ -96,15 +110,16 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         self._commanding = sorted((p for p in found if p[0].overrides("command")), key=lambda pair: pair[0].order)
         self._sensing = [pair for pair in found if pair[0].overrides("observe")]
         self._memory = [memories.get(effect.label, {}) for effect, _ in self._commanding]
-        for seam in (self._seam, "_get_obs"):
+        stack = corrections(self)
+        self._wanted = set()
+        for seam, answer, wanted in (
+            (self._seam, self._simulate, any(layer._acting or layer._commanding for layer in stack)),
+            ("_get_obs", self._observe, any(layer._sensing for layer in stack)),
+        ):
             vars(base).pop(seam, None)
-        self._hooks: dict[str, bool] = {}  # whether each was called yet
-        if self._acting or self._commanding:
-            setattr(base, self._seam, self._simulate)
-            self._hooks[self._seam] = False
-        if self._sensing:
-            base._get_obs = self._observe
-            self._hooks["_get_obs"] = False
+            if wanted:
+                setattr(base, seam, answer)
+                self._wanted.add(seam)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; commands from before it are forgotten."""
@@ -117,8 +132,8 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         :raises ValueError: the environment steps or reads its simulation by other ways than do_simulation and _get_obs
         """
         result = self.env.step(action)
-        if not all(self._hooks.values()):
-            unused = [name for name, called in self._hooks.items() if not called]
+        unused = sorted(self._wanted - self._called)
+        if unused:
             raise ValueError(
                 f"{type(self.unwrapped).__name__} does not use {' and '.join(unused)}, so its effects cannot act; "
                 "step the physics by self.do_simulation(ctrl, self.frame_skip) and read it in self._get_obs()"
@@ -129,22 +144,27 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         """In place of MujocoEnv's own: the same, with the effects in every substep."""
         base: Any = self.unwrapped
         model, data = base.model, base.data
-        self._hooks.update(dict.fromkeys(self._hooks.keys() & set(_SEAMS), True))
+        self._called.add(self._seam)
+        stack = corrections(self)
+        acting = [pair for layer in reversed(stack) for pair in layer._acting]
+        commanding = [
+            (*pair, memory) for layer in stack for pair, memory in zip(layer._commanding, layer._memory, strict=True)
+        ]
         world = LiveWorld(model, data)  # whose restore takes back the substeps' own changes alone
-        for effect, _ in self._acting:
+        for effect, _ in acting:
             if effect.place == "joint":
                 world.rough(effect.dof)
         world.settle()
         command, dt = np.array(ctrl, dtype=float), model.opt.timestep
         for _ in range(n_frames):
             sent = command.copy()
-            for (effect, x), memory in zip(self._commanding, self._memory):
+            for effect, x, memory in commanding:
                 sent[effect.index] = effect.command(np.array([sent[effect.index]]), x, memory, dt)[0]
             data.ctrl[:] = sent
-            if self._acting:
-                push(world, self._acting)
+            if acting:
+                push(world, acting)
             mujoco.mj_step(model, data)
-        if self._acting:
+        if acting:
             # What a later set_state computes must not depend on the substep before it.
             world.restore()
             data.qfrc_applied[:] = 0
@@ -152,11 +172,11 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
 
     def _observe(self, *args: Any, **kwargs: Any) -> Any:
         """In place of the task's own ``_get_obs``: the same, of what the sensors show."""
-        self._hooks["_get_obs"] = True
+        self._called.add("_get_obs")
         base: Any = self.unwrapped
         data = base.data
         qpos, qvel = data.qpos.copy(), data.qvel.copy()
-        for effect, x in self._sensing:
+        for effect, x in (pair for layer in reversed(corrections(self)) for pair in layer._sensing):
             q, v = effect.observe(np.array([data.qpos[effect.adr]]), np.array([data.qvel[effect.dof]]), x)
             data.qpos[effect.adr], data.qvel[effect.dof] = q[0], v[0]
         try:
@@ -178,20 +198,25 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         CorrectedEnv.__init__(self, **state)
 
 
-def is_corrected(env: gym.Env) -> bool:
-    """Whether any of its wrappers is a :class:`CorrectedEnv`."""
+def corrections(env: gym.Env) -> list[CorrectedEnv]:
+    """The wrappers that put effects into ``env``, outermost first; each acts on top of those after it."""
+    found: list[CorrectedEnv] = []
     while isinstance(env, gym.Wrapper):
         if isinstance(env, CorrectedEnv):
-            return True
+            found.append(env)
         env = env.env
-    return False
+    return found
+
+
+def beyond_model(env: gym.Env) -> list[str]:
+    """Labels of the effects in ``env`` that are no numbers of its model: forces, commands and sensors."""
+    pairs = (pair for c in corrections(env) for pair in (*c._acting, *c._commanding, *c._sensing))
+    return sorted({effect.label for effect, _ in pairs})
 
 
 def _steps(env: gym.Env) -> tuple[Any, str]:
     """The innermost environment and the name of the method that steps its physics."""
     base: Any = env.unwrapped
-    if is_corrected(env):
-        raise ValueError("env has effects already; give one CorrectedEnv all of them")
     seam = next((name for name in _SEAMS if callable(getattr(base, name, None))), None)
     mine = isinstance(getattr(base, "model", None), mujoco.MjModel) and isinstance(
         getattr(base, "data", None), mujoco.MjData

@@ -14,9 +14,9 @@ def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:
 
     :param env: a gymnasium MuJoCo environment, with all its wrappers; the copy draws no pictures and writes no files
         (for those ``CorrectedEnv(gym.make(..., render_mode=...), effects)``)
-    :param effects: with their values
+    :param effects: with their values; they come on top of those that ``env`` has already
     :raises TypeError: a VecEnv
-    :raises ValueError: no gymnasium MuJoCo environment, one that has effects already, or one that cannot be copied
+    :raises ValueError: no gymnasium MuJoCo environment, or one that cannot be copied
     """
     if not isinstance(env, gym.Env):
         raise TypeError(

@@ -14,9 +14,9 @@ from stable_baselines3 import SAC
 from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales, Simulation
 from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
-from sb3_rpto.effects.model import numbers
+from sb3_rpto.effects.model import load_model, numbers
 from sb3_rpto.effects.names import object_names
-from sb3_rpto.effects.wrapper import CorrectedEnv, is_corrected
+from sb3_rpto.effects.wrapper import CorrectedEnv, beyond_model, corrections
 from sb3_rpto.envs.state import copy_env
 
 POLE = "InvertedDoublePendulum-v5"
@@ -372,6 +372,76 @@ def test_a_copy_has_effects_of_its_own():
     assert_same(run(twin, actions), run(gym.make(POLE), actions))
 
 
+# --- effects on top of effects ----------------------------------------------------------------------------------------
+
+
+def test_effects_on_top_of_effects_are_all_of_them_at_once():
+    env, other = gym.make(POLE), gym.make(POLE)
+    every = [*effects(env.unwrapped.model), Bias("hinge", b=0.1)]
+    one = CorrectedEnv(env, every)
+    stacked = CorrectedEnv(CorrectedEnv(gym.wrappers.ClipAction(other), [*every[0:6:2], every[6], every[8]]), [])
+    stacked = CorrectedEnv(stacked, [*every[1:6:2], every[7]])
+    np.testing.assert_equal(fields(stacked), fields(one))
+    actions = actions_for(env, 40)
+    assert_same(run(stacked, actions), run(one, actions))
+    assert_same(run(copy_env(stacked), actions), run(one, actions))
+    assert_same(run(copy.deepcopy(stacked), actions), run(one, actions))
+    assert [len(layer.effects) for layer in corrections(stacked)] == [4, 0, 5]
+
+
+def test_upper_effects_go_and_come_over_those_beneath():
+    env, other = gym.make(POLE), gym.make(POLE)
+    lower, upper = effects(env.unwrapped.model)[::2], [*effects(env.unwrapped.model)[1::2], Bias("hinge", b=0.1)]
+    beneath = CorrectedEnv(env, lower)
+    only = fields(beneath)
+    top = CorrectedEnv(beneath, upper)
+    first = run(top, actions_for(env, 15))
+    top.set_effects([])
+    np.testing.assert_equal(fields(top), only)
+    assert_same(run(top, actions_for(env, 15)), run(CorrectedEnv(other, lower), actions_for(env, 15)))
+    top.set_effects(upper)
+    assert_same(run(top, actions_for(env, 15)), first)
+
+
+def test_numbers_are_changed_from_where_the_effects_beneath_left_them():
+    env = gym.make(POLE)
+    model, mass = env.unwrapped.model, env.unwrapped.model.body_mass.copy()
+    beneath = CorrectedEnv(env, [Declared(model, "pole.mass").with_values(np.array([2 * mass[2]]))])
+    inertia = model.body_inertia[2].copy()
+    CorrectedEnv(CorrectedEnv(beneath, [CoulombFriction("hinge", level=0.2)]), [CoulombFriction("hinge", level=0.3)])
+    assert model.dof_frictionloss[1] == pytest.approx(0.5)
+    on_top = CorrectedEnv(gym.wrappers.ClipAction(beneath), [Declared(model, "pole.mass").with_values(mass[2:3])])
+    assert model.body_mass[2] == pytest.approx(mass[2])
+    np.testing.assert_allclose(model.body_inertia[2], inertia / 2)
+    on_top.set_effects([])
+    assert model.body_mass[2] == 2 * mass[2]
+
+
+def test_sensors_and_commands_go_through_one_after_the_other():
+    """What is on top is nearer the agent: it commands first and observes last."""
+    env = gym.make(POLE)
+    beneath = CorrectedEnv(env, [Double("slide", g=1.0), Bias("hinge", b=0.1)])  # 2 u - 0.1; q + 0.1, 2 v
+    top = CorrectedEnv(beneath, [Double("slide", g=0.5), LIBRARY["sensor_gain"]("hinge", change=1.0)])  # 1.5 u - 0.1
+    top.reset(seed=0)
+    observation, *_ = top.step(np.array([0.2]))
+    base = env.unwrapped
+    assert base.data.ctrl[0] == pytest.approx(2 * (1.5 * 0.2 - 0.1) - 0.1)
+    assert observation[1] == pytest.approx(np.sin(2 * (base.data.qpos[1] + 0.1)))
+
+
+def test_what_is_covered_cannot_be_set_and_what_no_number_says_is_named():
+    env = gym.make(POLE)
+    beneath = CorrectedEnv(env, effects(env.unwrapped.model)[:4])
+    assert beyond_model(beneath) == []
+    top = CorrectedEnv(beneath, [Clock("hinge", a=1.0), Lag("slide", time=0.1), Bias("hinge", b=0.1), Clock("hinge2")])
+    assert beyond_model(top) == ["test_bias(hinge)", "test_clock(hinge)", "test_lag(slide)"]
+    with pytest.raises(ValueError, match="other effects came on top"):
+        beneath.set_effects([])
+    with pytest.raises(ValueError, match=r"no numbers of its model \(test_bias\(hinge\), test_clock"):
+        load_model(top)
+    assert load_model(beneath)[1].body_mass[1] == pytest.approx(7.0)
+
+
 # --- errors and the rest ----------------------------------------------------------------------------------------------
 
 
@@ -380,10 +450,6 @@ def test_other_environments_are_refused():
         CorrectedEnv(gym.make("Pendulum-v1"), [])
     with pytest.raises(ValueError, match="no joint 'elbow'"):
         CorrectedEnv(gym.make(POLE), [CoulombFriction("elbow", level=1.0)])
-    wrapped = CorrectedEnv(gym.make(POLE), [])
-    assert is_corrected(wrapped)
-    with pytest.raises(ValueError, match="has effects already"):
-        CorrectedEnv(wrapped, [])
 
 
 def test_an_environment_that_goes_round_the_seam_is_found_out():

@@ -89,6 +89,16 @@ def test_shifts_of_the_source_are_kept():
     assert fields(apply_effects(source, []))["dof_damping"][0] == 1.25
 
 
+def test_a_corrected_environment_is_corrected_again():
+    model = gym.make(POLE).unwrapped.model
+    every = effects(model)
+    once, twice = (
+        apply_effects(gym.make(POLE), every),
+        apply_effects(apply_effects(gym.make(POLE), every[2:]), every[:2]),
+    )
+    assert_same(run(twice, actions_for(30), seed=3), run(once, actions_for(30), seed=3))
+
+
 def test_copies_branch_exactly_and_alone():
     corrected = apply_effects(gym.make(POLE), effects(gym.make(POLE).unwrapped.model))
     run(corrected, actions_for(7), seed=0)
@@ -143,8 +153,6 @@ def test_bad_environments_are_named():
         apply_effects(make_vec_env(POLE), [])
     with pytest.raises(ValueError, match="no gymnasium MuJoCo environment"):
         apply_effects(gym.make("Pendulum-v1"), [])
-    with pytest.raises(ValueError, match="has effects already"):
-        apply_effects(apply_effects(gym.make(POLE), []), [])
     stuck = gym.make(POLE)
     stuck.unwrapped.lock = (n for n in ())  # generators cannot be copied
     with pytest.raises(ValueError, match="cannot be copied"):
