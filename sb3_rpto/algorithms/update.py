@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import ClassVar
 
@@ -14,6 +15,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.sac.policies import SACPolicy
 from torch.nn import functional as F
 
+from sb3_rpto.algorithms.forward import descend, follow, fuse, sample_actions, smallest_q
 from sb3_rpto.buffers import DualReplayBuffer, World, chronological
 from sb3_rpto.dynamics.base import Dynamics, Transitions
 from sb3_rpto.dynamics.products import fast_products
@@ -21,6 +23,8 @@ from sb3_rpto.dynamics.weights import WeightingName, effective_sample_size, rto_
 
 #: The actor's batches alternate: four from D_target, then one from D_source (f = 5 in the paper's appendix).
 ALTERNATION = 5
+#: Updates whose batches are gathered at once.
+BURST = 64
 
 
 class RelativeUpdate(SAC):
@@ -68,36 +72,44 @@ class RelativeUpdate(SAC):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        policy_learns = self.updates_policy or self._pretraining
+        for optimizer in optimizers:
+            fuse(optimizer)
         losses: dict[str, list[th.Tensor]] = {}
         with fast_products(self.device):
-            for gradient_step in range(gradient_steps):
-                critic_batch, actor_batch = self.sample_batches(batch_size)
-                step_losses: dict[str, th.Tensor] = {}
-                step_losses["ent_coef"] = ent_coef = self.temperature()
-                # The order is SAC's: the actor samples first, its loss then uses the updated critic.
-                if policy_learns:
-                    if self.use_sde:
-                        self.actor.reset_noise()
-                    actions_pi, log_prob = self.actor.action_log_prob(actor_batch.observations)
-                    log_prob = log_prob.reshape(-1, 1)
-                    if self.ent_coef_optimizer is not None:
-                        step_losses["ent_coef_loss"] = self.temperature_loss(log_prob)
-                        _descend(self.ent_coef_optimizer, step_losses["ent_coef_loss"])
-                step_losses["critic_loss"] = self.critic_loss(critic_batch, ent_coef)
-                _descend(self.critic.optimizer, step_losses["critic_loss"])
-                if policy_learns:
-                    step_losses["actor_loss"] = self.actor_loss(actor_batch, actions_pi, log_prob, ent_coef)
-                    _descend(self.actor.optimizer, step_losses["actor_loss"])
-                if gradient_step % self.target_update_interval == 0:
-                    polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-                    polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
-                for name, loss in step_losses.items():
-                    losses.setdefault(name, []).append(loss.detach().reshape(()))
+            for first in range(0, gradient_steps, BURST):
+                batches = self.sample_batches(min(BURST, gradient_steps - first), batch_size)
+                for step, (critic_batch, actor_batch) in enumerate(batches, first):
+                    for name, loss in self.update_once(critic_batch, actor_batch).items():
+                        losses.setdefault(name, []).append(loss.detach().reshape(()))
+                    if step % self.target_update_interval == 0:
+                        follow(self.critic_target.parameters(), self.critic.parameters(), self.tau)
+                        polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in losses.items():  # read here at once: reading each would wait for the device every step
             self.logger.record(f"train/{name}", float(np.mean(th.stack(values).tolist())))
+
+    def update_once(self, critic_batch: ReplayBufferSamples, actor_batch: ReplayBufferSamples) -> dict[str, th.Tensor]:
+        """One update of temperature, critic and actor, in SAC's order: the actor's loss uses the updated critic.
+
+        :return: the losses, to log
+        """
+        ent_coef = self.temperature()
+        losses = {"ent_coef": ent_coef}
+        policy_learns = self.updates_policy or self._pretraining
+        if policy_learns:
+            if self.use_sde:
+                self.actor.reset_noise()
+            actions_pi, log_prob = sample_actions(self.actor, actor_batch.observations)
+            if self.ent_coef_optimizer is not None:
+                losses["ent_coef_loss"] = self.temperature_loss(log_prob)
+                descend(self.ent_coef_optimizer, losses["ent_coef_loss"])
+        losses["critic_loss"] = self.critic_loss(critic_batch, ent_coef)
+        descend(self.critic.optimizer, losses["critic_loss"])
+        if policy_learns:
+            losses["actor_loss"] = self.actor_loss(actor_batch, actions_pi, log_prob, ent_coef)
+            descend(self.actor.optimizer, losses["actor_loss"])
+        return losses
 
     def fit_dynamics(self) -> None:
         """Step 6, RTO: every ``model_train_freq`` target steps move phi towards D_target by the weighted loss."""
@@ -142,30 +154,49 @@ class RelativeUpdate(SAC):
     def _close_the_loop(self) -> None:
         """After a fit: trace what the simulator lacks, where that was asked for and is due."""
 
-    def sample_batches(self, batch_size: int) -> tuple[ReplayBufferSamples, ReplayBufferSamples]:
-        """A batch for the critic, mostly of D_source, and one for the actor, alternating between the worlds.
+    def sample_batches(
+        self, count: int, batch_size: int
+    ) -> Iterator[tuple[ReplayBufferSamples, ReplayBufferSamples]]:
+        """For each of ``count`` updates a batch for the critic, mostly of D_source, and one for the actor.
 
         The actor sees four batches of D_target, then one of D_source; D_source alone as long as D_target could not
-        fill a batch.
+        fill a batch; a policy that does not learn sees the critic's. All are gathered at once.
         """
-        buffer, normaliser = self.replay_buffer, self._vec_normalize_env
         if self._pretraining:  # plain SAC: one batch of the only world there is
-            batch = buffer.sample(batch_size, env=normaliser, world="source")
-            return batch, batch
-        n_target = round(self.real_ratio * batch_size) if buffer.target.size() > 0 else 0
-        critic_batch = buffer.sample(batch_size - n_target, env=normaliser, world="source")
+            yield from ((batch, batch) for batch in self._draw("source", count, batch_size))
+            return
+        seen = self.replay_buffer.target.size()
+        n_target = round(self.real_ratio * batch_size) if seen > 0 else 0
+        for_critic = self._draw("source", count, batch_size - n_target)
         if n_target > 0:
-            critic_batch = _concatenate(critic_batch, buffer.sample(n_target, env=normaliser))
-        from_source = self._actor_updates % ALTERNATION == ALTERNATION - 1 or buffer.target.size() < batch_size
-        self._actor_updates += 1
-        return critic_batch, buffer.sample(batch_size, env=normaliser, world="source" if from_source else "target")
+            for_critic = map(_concatenate, for_critic, self._draw("target", count, n_target))
+        if not self.updates_policy:
+            yield from ((batch, batch) for batch in for_critic)
+            return
+        turns = [(self._actor_updates + i) % ALTERNATION == ALTERNATION - 1 for i in range(count)]
+        from_source = [turn or seen < batch_size for turn in turns]
+        for_actor = {
+            True: self._draw("source", sum(from_source), batch_size),
+            False: self._draw("target", count - sum(from_source), batch_size),
+        }
+        for turn, critic_batch in zip(from_source, for_critic):
+            self._actor_updates += 1
+            yield critic_batch, next(for_actor[turn])
+
+    def _draw(self, world: World, count: int, batch_size: int) -> Iterator[ReplayBufferSamples]:
+        """``count`` batches of one world, gathered at once, in the networks' precision."""
+        if count == 0:
+            return
+        drawn = self.replay_buffer.sample(count * batch_size, env=self._vec_normalize_env, world=world)
+        for rows in zip(*(values.float().split(batch_size) for values in drawn[:5])):
+            yield ReplayBufferSamples(*rows)
 
     def critic_loss(self, batch: ReplayBufferSamples, ent_coef: th.Tensor) -> th.Tensor:
         """Soft Bellman residual, Eq. soft_q: half the sum over critics of the mean squared error."""
         with th.no_grad():
-            next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
-            next_q = _smallest(self.critic_target(batch.next_observations, next_actions))
-            next_value = next_q - ent_coef * next_log_prob.reshape(-1, 1)
+            next_actions, next_log_prob = sample_actions(self.actor, batch.next_observations)
+            next_q = smallest_q(self.critic_target, batch.next_observations, next_actions)
+            next_value = next_q - ent_coef * next_log_prob
             target = batch.rewards + (1 - batch.dones) * self.gamma * next_value
         return 0.5 * th.stack([F.mse_loss(q, target) for q in self.critic(batch.observations, batch.actions)]).sum()
 
@@ -173,7 +204,7 @@ class RelativeUpdate(SAC):
         self, batch: ReplayBufferSamples, actions_pi: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor
     ) -> th.Tensor:
         """RPO, Eq. sac: states of the target, values of the source; alpha log pi - min_i Q_i(s, a)."""
-        return (ent_coef * log_prob - _smallest(self.critic(batch.observations, actions_pi))).mean()
+        return (ent_coef * log_prob - smallest_q(self.critic, batch.observations, actions_pi)).mean()
 
     def temperature(self) -> th.Tensor:
         """The current entropy coefficient alpha, without gradient."""
@@ -188,14 +219,14 @@ class RelativeUpdate(SAC):
         """V(s) = min_i Q_target,i(s, a) - alpha log pi(a|s) with a ~ pi(s), raw observations (n, d) -> (n,)."""
         with th.no_grad():
             seen = self._normalised(observations)
-            actions, log_prob = self.actor.action_log_prob(seen)
-            return _smallest(self.critic_target(seen, actions))[:, 0] - self.temperature() * log_prob
+            actions, log_prob = sample_actions(self.actor, seen)
+            return (smallest_q(self.critic_target, seen, actions) - self.temperature() * log_prob)[:, 0]
 
     def q_value(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """min_i Q_target,i(s, a) of raw observations (n, d) and actions in the environment's units -> (n,)."""
         with th.no_grad():
             scaled = self.scale_actions(actions).float()
-            return _smallest(self.critic_target(self._normalised(observations), scaled))[:, 0]
+            return smallest_q(self.critic_target, self._normalised(observations), scaled)[:, 0]
 
     def scale_actions(self, actions: th.Tensor) -> th.Tensor:
         """Actions in the environment's units -> [-1, 1], the scale of the networks and the buffers; (n, action_dim)."""
@@ -234,18 +265,6 @@ def as_transitions(arrays: dict[str, np.ndarray], policy: SACPolicy, device: th.
     tensors = {name: th.as_tensor(array, device=device) for name, array in arrays.items()}
     tensors["actions"] = th.as_tensor(policy.unscale_action(arrays["actions"]), device=device)
     return Transitions(**tensors)
-
-
-def _descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
-    """One step of ``optimizer``; only its own parameters get gradients (the actor's loss spares the critic's)."""
-    optimizer.zero_grad()
-    loss.backward(inputs=[parameter for group in optimizer.param_groups for parameter in group["params"]])
-    optimizer.step()
-
-
-def _smallest(q_values: tuple[th.Tensor, ...]) -> th.Tensor:
-    """The pessimistic estimate min_i Q_i, (n, 1), of what a critic answers."""
-    return th.cat(q_values, dim=1).min(dim=1, keepdim=True)[0]
 
 
 def _concatenate(a: ReplayBufferSamples, b: ReplayBufferSamples) -> ReplayBufferSamples:
