@@ -176,7 +176,7 @@ def test_the_table_of_effects_is_the_library():
 
 DECLARED = "| object | parameter | unit | bounds |"
 ONE_OF_EACH = """<mujoco><option density="1" viscosity="1"/><worldbody><body name="body">
-<joint name="joint" damping="1" frictionloss="1" armature="1" stiffness="1"/>
+<joint name="joint" damping="1" frictionloss="1" armature="1" stiffness="1" range="-1 1"/>
 <geom name="geom" type="capsule" fromto="0 0 0 1 0 0" size=".1"/></body></worldbody>
 <actuator><position name="actuator" joint="joint" kp="1"/></actuator></mujoco>"""
 

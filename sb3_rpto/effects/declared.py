@@ -76,6 +76,19 @@ def _write_strength(world: World, actuator: int, values: np.ndarray, nominal: fl
         world.field(name)[:, actuator] *= values[:, None]
 
 
+def _range(model: mujoco.MjModel, joint: int) -> float:
+    low, high = model.jnt_range[joint]
+    return float(high - low) if model.jnt_limited[joint] else 0.0
+
+
+def _write_range(world: World, joint: int, values: np.ndarray, nominal: float) -> None:
+    limits = world.field("jnt_range")[:, joint]
+    # The range keeps the reference pose, or the bound next to it.
+    reference = world.model.qpos0[world.model.jnt_qposadr[joint]]
+    pivot = np.clip(reference, limits[:, :1], limits[:, 1:])
+    limits[:] = pivot + (limits - pivot) * (values / nominal)[:, None]
+
+
 def _one(model: mujoco.MjModel, index: int) -> float:
     return 1.0
 
@@ -95,6 +108,7 @@ _KINDS: dict[str, dict[str, _Kind]] = {
         "frictionloss": _Kind("N·m", *_dof("dof_frictionloss"), _friction_size),
         "armature": _Kind("kg·m²", *_dof("dof_armature"), lambda s: 0.05 * s.inertia),
         "stiffness": _Kind("N·m/rad", *_column("jnt_stiffness"), lambda s: 0.05 * s.torque / s.span),
+        "range": _Kind("rad", _range, _write_range, lambda s: s.span, _POSITIVE),
     },
     "body": {
         "mass": _Kind("kg", *_column("body_mass")[:1], _write_mass, lambda s: 0.05 * s.mass, _POSITIVE),
@@ -144,6 +158,7 @@ _OPTIONS: dict[str, _Kind] = {
 class Declared(Effect):
     """One number of the model that its user declared unknown, e.g. ``hinge.damping``; its null is the nominal value.
 
+    ``range`` is the width of a joint's limits, about the point in them that is nearest to the reference pose;
     ``mass`` scales the inertia with it, ``inertia`` leaves the mass, ``length`` is that of a link: its capsules and
     the offsets of its children, at constant density (see :mod:`sb3_rpto.effects.length`); ``kp`` is the stiffness of
     a position servo, ``strength`` a factor on all that an actuator does (gain, bias and force limits).

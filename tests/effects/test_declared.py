@@ -169,3 +169,21 @@ def test_mass_scales_inertia_and_inertia_leaves_mass(factor: float) -> None:
     round_ = written(BatchWorld(MODEL, 1, 1), "arm.inertia", factor * inertia[0])
     assert round_.batch.expand("body_mass")[0, body] == mass
     np.testing.assert_allclose(round_.field("body_inertia")[0, body], factor * inertia)
+
+
+def test_the_range_of_a_joint_keeps_the_reference_pose_or_the_bound_next_to_it() -> None:
+    model = mujoco.MjModel.from_xml_string("""<mujoco><compiler angle="radian"/><worldbody><body>
+        <joint name="around" range="-1 0.5"/><joint name="away" range="0.4 1"/><joint name="moved" ref="2" range="1 3"/>
+        <joint name="free"/><geom size="1"/></body></worldbody></mujoco>""")
+    found = declare(model, ["*.range"])
+    assert {d.label: d.values[0] for d in found} == pytest.approx(
+        {"around.range": 1.5, "away.range": 0.6, "moved.range": 2}
+    )
+    world = BatchWorld(model, 2, 1)
+    for parameter in found:
+        parameter.write(world, parameter.values * np.array([[0.5], [2.0]]))
+    half, double = world.field("jnt_range")
+    np.testing.assert_allclose(half[:3], [(-0.5, 0.25), (0.4, 0.7), (1.5, 2.5)])
+    np.testing.assert_allclose(double[:3], [(-2, 1), (0.4, 1.6), (0, 4)])
+    with pytest.raises(ValueError, match=r"free\.range is 0 in the model"):
+        Declared(model, "free.range")
