@@ -84,8 +84,8 @@ class _Link:
             for i in range(count):
                 if owner[i] == body:
                     self.put(name, i, self.moved(self.get(name, i)))
-        for child in np.flatnonzero(model.body_parentid == body):
-            if child:  # the world is its own parent
+        for child in range(1, model.nbody):
+            if model.body_parentid[child] == body:
                 arm = self.arm(child, self.anchor(child))
                 self.put("body_pos", child, self.moved(self.get("body_pos", child) + arm) - arm)
 

@@ -121,6 +121,11 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
                 setattr(base, seam, answer)
                 self._wanted.add(seam)
 
+    @property
+    def alters_observations(self) -> bool:
+        """Whether sensors, of these effects or of those beneath, show something else than the state."""
+        return any(layer._sensing for layer in corrections(self))
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; commands from before it are forgotten."""
         self._memory = [{} for _ in self._commanding]

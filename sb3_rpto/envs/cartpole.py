@@ -161,6 +161,16 @@ class ContinuousCartPoleEnv(gym.Env[np.ndarray, np.ndarray]):
         """The physical constants of this world."""
         return self._parameters
 
+    def scale(self, factors: Mapping[str, float]) -> None:
+        """Multiply constants from now on; an episode under way goes on in the other world.
+
+        :param factors: by name of the constant
+        :raises ValueError: for a constant that leaves its range
+        """
+        constants = {name: self._constants[name] * factor for name, factor in factors.items()}
+        self._parameters = CartPoleParameters(**{**self._constants, **constants})
+        self._constants = asdict(self._parameters)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:

@@ -25,7 +25,7 @@ Rule = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
 # Wrappers that pass observations, actions and rewards on unchanged; by name, since a subprocess tells no more.
 HARMLESS_WRAPPERS = {
     *("TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "Autoreset", "Monitor", "RecordEpisodeStatistics"),
-    *("RecordVideo", "RenderCollection", "HumanRendering", "DynamicsEnv"),
+    *("RecordVideo", "RenderCollection", "HumanRendering", "DynamicsEnv", "CorrectedEnv", "ShiftedEnv"),
 }
 # The action of the buffer is not the one that the task's reward sees; its termination does not mind.
 _CHANGES_ACTIONS = {"ClipAction", "RescaleAction"}
@@ -97,12 +97,17 @@ class _View:
             return self.env.get_wrapper_attr(name)
         return self.vec_env.get_attr(name, indices=0)[0]  # type: ignore[union-attr]
 
+    @property
+    def sensed(self) -> bool:
+        """Whether the observation is not the state's, but what effects in the sensors make of it."""
+        return self.has("alters_observations") and self["alters_observations"]
+
     def own_rule(self, name: str) -> Rule | None:
         """The environment's own rule, unless a wrapper changes what goes into or comes out of it."""
         changing: list[type[gym.Wrapper]] = [gym.ObservationWrapper, gym.ActionWrapper]
         if name == "reward_fn":
             changing.append(gym.RewardWrapper)
-        if not self.has(name) or any(self._is_wrapped(wrapper) for wrapper in changing):
+        if not self.has(name) or self.sensed or any(self._is_wrapped(wrapper) for wrapper in changing):
             return None
         env = self.env or self._twin()
         rule = env.get_wrapper_attr(name) if env is not None and env.has_wrapper_attr(name) else None
@@ -125,7 +130,8 @@ class _View:
 def _known_task(view: _View) -> TaskRules:
     """The rules of a gymnasium task, or none."""
     find = _TASKS.get(_task_name(view) or "")
-    if find is None or not view.understood or not view.wrappers <= (HARMLESS_WRAPPERS | _CHANGES_ACTIONS):
+    known = view.understood and view.wrappers <= (HARMLESS_WRAPPERS | _CHANGES_ACTIONS)
+    if find is None or not known or view.sensed:
         return TaskRules(None, None)
     try:
         rules = find(view)
@@ -142,7 +148,8 @@ def _task_name(view: _View) -> str | None:
             if cls.__module__.startswith(("gymnasium.envs.mujoco.", "gymnasium.envs.classic_control.")):
                 name = cls.__name__.removesuffix("Env")
                 return "MountainCarContinuous" if name == "Continuous_MountainCar" else name
-    task = re.fullmatch(r"(?:rpto/)?(\w+)-v\d+", view.id or "")
+    # Ours may be targets: rpto/Hopper-gravity-x0.5-v0.
+    task = re.fullmatch(r"rpto/(\w+)(?:-[\w.-]+)?-v\d+", view.id or "") or re.fullmatch(r"(\w+)-v\d+", view.id or "")
     return task[1] if task else None
 
 

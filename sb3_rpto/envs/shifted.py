@@ -1,0 +1,69 @@
+"""Gymnasium's MuJoCo environments with a shift in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+
+from sb3_rpto.effects.declared import Declared
+from sb3_rpto.effects.effect import Effect, from_json
+from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.shifts import EnvShift, as_shift, number_names
+from sb3_rpto.envs.stance import Stance
+
+
+def shift_effects(shift: EnvShift, env: gym.Env) -> list[Effect]:
+    """What a shift does to a MuJoCo environment: declared numbers with other values, and effects.
+
+    :raises ValueError: names that the model does not have, numbers that are 0
+    """
+    model = env.unwrapped.model  # type: ignore[attr-defined]
+    scaled: dict[str, Declared] = {}
+    for name, factor in shift.factors.items():
+        for label in number_names(env, [name]):
+            number = scaled.get(label) or Declared(model, label, (-np.inf, np.inf))
+            if number.nominal == 0:
+                raise ValueError(f"{shift.name}: {label} is 0 in the model, so it cannot be scaled; give an effect")
+            scaled[label] = number.with_values(number.values * factor)
+    return [*scaled.values(), *map(from_json, shift.effects)]  # type: ignore[arg-type]
+
+
+class ShiftedEnv(CorrectedEnv):
+    """A gymnasium MuJoCo environment with a shift, on its feet.
+
+    As :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`, and its start height and healthy heights follow its body
+    (:class:`~sb3_rpto.envs.stance.Stance`).
+
+    :param env: one whose innermost environment has MuJoCo's ``model`` and ``data`` and steps them by ``do_simulation``;
+        with effects or not
+    :param shift: factors and effects, relative to ``env`` as it is
+    :raises ValueError: no MuJoCo environment, names that its model does not have
+    """
+
+    def __init__(self, env: gym.Env, shift: EnvShift | Mapping[str, Any]) -> None:
+        shift = as_shift(shift)
+        RecordConstructorArgs.__init__(self, shift=asdict(shift))  # plain data, for specs as JSON
+        self.shift = shift
+        base: Any = env.unwrapped
+        if not isinstance(getattr(base, "model", None), mujoco.MjModel):
+            raise ValueError(f"{type(base).__name__} is neither a gymnasium MuJoCo environment nor a cart-pole")
+        self._stance = Stance(base)
+        CorrectedEnv.__init__(self, env, shift_effects(shift, env))
+
+    def set_effects(self, effects: Sequence[Effect]) -> None:
+        """As in :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`; the walker stands on its feet at the next reset."""
+        super().set_effects(effects)
+        self._stance.take(self.unwrapped)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "shift": self.shift}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        ShiftedEnv.__init__(self, state["env"], state["shift"])
+        self.set_effects(state["effects"])

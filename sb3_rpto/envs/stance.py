@@ -1,0 +1,77 @@
+"""How a walker stands: where its feet are at reset, and which heights count as healthy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+_FAR = 1e3  # m, farther than any robot's feet
+_FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+class Stance:
+    """Stands a walker whose body has changed as it stood before.
+
+    Its lowest point at reset keeps its distance from the floor, and ``_healthy_z_range``, where the task has one, keeps
+    its proportion to the height of the root body over that lowest point. Tasks without a vertical coordinate or a floor
+    are left alone.
+
+    :param base: an unwrapped gymnasium MuJoCo environment, as it stands before
+    """
+
+    def __init__(self, base: Any) -> None:
+        self._joint = _vertical(base.model) if hasattr(base, "init_qpos") else None
+        found = None if self._joint is None else _heights(base.model, self._joint, base.init_qpos)
+        if found is None:
+            self._joint = None
+            return
+        self._qpos = base.init_qpos.copy()
+        self._gap, self._height = found
+        self._healthy: tuple[float, float] | None = getattr(base, "_healthy_z_range", None)
+
+    def take(self, base: Any) -> None:
+        """Stand the walker of ``base`` as it is now: its start height and healthy heights are set."""
+        if self._joint is None:
+            return
+        found = _heights(base.model, self._joint, self._qpos)
+        assert found is not None  # the floor stays
+        column = _address(base.model, self._joint)
+        base.init_qpos[column] = self._qpos[column] + self._gap - found[0]
+        if self._healthy is not None:
+            low, high = self._healthy
+            scale = found[1] / self._height
+            base._healthy_z_range = (low * scale, high * scale)
+
+
+def _vertical(model: mujoco.MjModel) -> int | None:
+    """The joint that holds the height of a body in the world: a free joint, or a slide along z; None without."""
+    for joint in range(model.njnt):
+        body = int(model.jnt_bodyid[joint])
+        if model.body_parentid[body] != 0:
+            continue
+        upright = np.array_equal(model.jnt_axis[joint], (0, 0, 1)) and np.array_equal(
+            model.body_quat[body], (1, 0, 0, 0)
+        )
+        if model.jnt_type[joint] == _FREE or (model.jnt_type[joint] == _SLIDE and upright):
+            return joint
+    return None
+
+
+def _address(model: mujoco.MjModel, joint: int) -> int:
+    return int(model.jnt_qposadr[joint]) + (2 if model.jnt_type[joint] == _FREE else 0)
+
+
+def _heights(model: mujoco.MjModel, joint: int, qpos: np.ndarray) -> tuple[float, float] | None:
+    """Of the lowest point over the floor, and of the body's origin over that point, m; None without a floor."""
+    static = model.body_weldid[model.geom_bodyid] == 0
+    floors = np.flatnonzero(static & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE))
+    if not len(floors) or static.all():
+        return None
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    floor = int(floors[0])
+    gap = min(mujoco.mj_geomDistance(model, data, floor, int(g), _FAR, None) for g in np.flatnonzero(~static))
+    return gap, float(data.xpos[model.jnt_bodyid[joint], 2] - data.geom_xpos[floor, 2]) - gap
