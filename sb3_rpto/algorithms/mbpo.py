@@ -1,0 +1,75 @@
+"""Model-Based Policy Optimization, and the loop that PDML, PTP and SLBO hook into."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_rpto.algorithms.transfer import TransferAlgorithm
+
+#: Arguments of RPTO that have no meaning where the model is fitted without weights and nothing is declared.
+UNUSED = frozenset({"preset", "dynamics", "declared", "close_loop", "weighting", "weight_floor"})
+
+
+class MBPO(TransferAlgorithm):
+    """Model-Based Policy Optimization, warm-started: SAC on branches of a model that is fitted to the target.
+
+    Paper: https://arxiv.org/abs/1906.08253 (Janner, Fu, Zhang, Levine: When to Trust Your Model: Model-Based Policy
+    Optimization, NeurIPS 2019).
+
+    It is the loop of :class:`~sb3_rpto.RPTO` with RTO's weights left out (``weighting=None``), branches from states of
+    D_target alone, and one batch for critic and actor alike: D_source with a share ``real_ratio`` of D_target.
+
+    What others change of it are four methods: ``_make_source_world`` (where branches start, which answer is kept: PDML,
+    PTP), ``_fit_to_transitions`` (how the model is fitted: PDML, PTP), ``_make_dynamics`` and ``update`` (another loss,
+    another policy optimiser: SLBO).
+
+    :param args: as those of :class:`~sb3_rpto.algorithms.transfer.TransferAlgorithm`
+    :param kwargs: likewise, without those in :data:`UNUSED`; what is not passed is :meth:`published`
+    :raises ValueError: for an argument in :data:`UNUSED`
+    """
+
+    updates_policy: ClassVar[bool] = True
+    updates_dynamics: ClassVar[bool] = True
+
+    #: the paper's numbers, in constructor arguments; of the tasks by their names where they differ
+    NUMBERS: ClassVar[dict[str, Any]] = {
+        "gradient_steps": 20,
+        "source_steps": 400,
+        "buffer_size": 400_000,
+        "model_train_freq": 250,
+        "real_ratio": 0.05,
+        "rollout_start": "target",
+    }
+    NUMBERS_OF_TASKS: ClassVar[dict[str, dict[str, Any]]] = {"HalfCheetah": {"gradient_steps": 40}}
+
+    @classmethod
+    def published(cls, env_id: str | None) -> dict[str, Any]:
+        """The paper's numbers for a task, as constructor arguments.
+
+        :param env_id: "HalfCheetah-v5" and "rpto/HalfCheetah-v0" are the same task; None: no task in particular
+        """
+        task = re.sub(r"^.*[:/]|-v\d+$", "", env_id or "")
+        return {**cls.NUMBERS, **cls.NUMBERS_OF_TASKS.get(task, {})}
+
+    def _apply_preset(self) -> None:
+        spec = None if self.env is None else self.env.get_attr("spec", indices=[0])[0]
+        passed = self._passed - ({"source_steps"} if self.source_steps == "auto" else set())
+        for name, value in self.published(spec.id if spec else None).items():
+            if name not in passed:
+                setattr(self, name, value)
+        self.weighting = None
+
+    def _check_arguments(self) -> None:
+        unused = sorted(UNUSED & self._passed)
+        if unused:
+            raise ValueError(f"{type(self).__name__} does not use {unused}; leave them out or use RPTO")
+        super()._check_arguments()
+
+    def sample_batches(self, count: int, batch_size: int) -> Iterator[tuple[ReplayBufferSamples, ReplayBufferSamples]]:
+        """The critic's batches of RPTO, for the actor too."""
+        for critic_batch, _ in super().sample_batches(count, batch_size):
+            yield critic_batch, critic_batch
