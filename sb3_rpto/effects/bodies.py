@@ -47,7 +47,7 @@ class Payload(Effect):
         tensor = to_tensor(inertia[heavier, self.index], frame[heavier, self.index])
         tensor += spread(m, c - new) + spread(added, p - new)
         mass[heavier, self.index], centre[heavier, self.index] = total, new
-        inertia[heavier, self.index], frame[heavier, self.index] = from_tensor(tensor)
+        inertia[heavier, self.index], frame[heavier, self.index] = from_tensor(tensor, frame[heavier, self.index])
 
 
 @register

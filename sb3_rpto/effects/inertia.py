@@ -36,12 +36,23 @@ def to_tensor(inertia: np.ndarray, quat: np.ndarray) -> np.ndarray:
     return (axes * inertia[:, None, :]) @ np.swapaxes(axes, 1, 2)
 
 
-def from_tensor(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The inverse of :func:`to_tensor`: principal moments, largest first as MuJoCo has them, and quaternions."""
+def from_tensor(tensor: np.ndarray, near: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The inverse of :func:`to_tensor`: principal moments, largest first as MuJoCo has them, and quaternions.
+
+    :param tensor: (n, 3, 3)
+    :param near: quaternions (n, 4) of frames that are kept where they are principal. Of a body of revolution many are,
+        and MuJoCo's drag in a fluid, on a box in the principal frame, depends on which is taken
+    """
     moments, axes = np.linalg.eigh(tensor)
-    moments, axes = moments[:, ::-1], axes[:, :, ::-1].copy()
+    moments, axes = moments[:, ::-1].copy(), axes[:, :, ::-1].copy()
     axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
     quat = np.empty((len(tensor), 4))
     for i, matrix in enumerate(axes):
         mujoco.mju_mat2Quat(quat[i], matrix.ravel())
+    if near is not None:
+        turned = np.swapaxes(matrices(near), 1, 2) @ tensor @ matrices(near)
+        diagonal = np.einsum("nii->ni", turned)
+        rest = np.abs(turned - diagonal[:, None, :] * np.eye(3)).max(axis=(1, 2))
+        kept = rest <= 1e-12 * np.trace(tensor, axis1=1, axis2=2)
+        moments[kept], quat[kept] = diagonal[kept], near[kept]
     return moments, quat

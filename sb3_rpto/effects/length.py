@@ -156,7 +156,7 @@ class _Link:
         centre = first / mass[:, None]
         second -= mass[:, None, None] * centre[:, :, None] * centre[:, None, :]
         tensor = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
-        inertia, frame = from_tensor(tensor)
+        inertia, frame = from_tensor(tensor, near=self.get("body_iquat", body))
         for name, values in (
             ("body_mass", mass),
             ("body_ipos", centre),

@@ -171,3 +171,33 @@ def test_principal_frames_invert() -> None:
         expected = np.empty(9)
         mujoco.mju_quat2Mat(expected, q)
         np.testing.assert_allclose(matrix.ravel(), expected, atol=1e-14)
+
+
+def test_principal_frames_are_kept_where_they_are_principal() -> None:
+    rng = np.random.default_rng(2)
+    near = rng.normal(size=(4, 4))
+    near /= np.linalg.norm(near, axis=1, keepdims=True)
+    moments = np.array([(1.0, 1.0, 0.3), (0.2, 0.7, 0.7), (1.0, 2.0, 2.5), (1.0, 1.0, 1.0)])
+    tensor = to_tensor(moments, near)
+    kept, quat = from_tensor(tensor, near)
+    np.testing.assert_allclose(kept, moments)
+    np.testing.assert_array_equal(quat, near)
+    turned = np.roll(near, 1, axis=0)
+    np.testing.assert_allclose(to_tensor(*from_tensor(tensor, turned)), tensor, atol=1e-12)
+    assert not np.array_equal(from_tensor(tensor, turned)[1][:3], turned[:3])
+
+
+def test_drag_does_not_jump_with_the_length() -> None:
+    """A capsule is a body of revolution: which of its principal frames is taken decides on MuJoCo's drag."""
+    model = mujoco.MjModel.from_xml_path(str(ASSETS / "swimmer.xml"))
+    accelerations = []
+    for scale in (1.0, 1 + 1e-9):
+        stretched, data = model.__copy__(), mujoco.MjData(model)
+        world = LiveWorld(stretched, data)
+        for body in (1, 2, 3):
+            write_length(world, body, np.array([scale * link_length(model, body)]), link_length(model, body))
+        world.settle()
+        data.qvel[:] = np.random.default_rng(0).normal(size=model.nv)
+        mujoco.mj_forward(stretched, data)
+        accelerations.append(data.qacc.copy())
+    np.testing.assert_allclose(*accelerations, rtol=1e-6)
