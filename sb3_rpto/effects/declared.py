@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -185,11 +185,26 @@ class Declared(Effect):
         lower, upper = bounds or ((0.0, np.inf) if how.span is None else tuple(nominal * s for s in how.span))
         if not lower <= nominal <= upper or lower == upper:
             raise ValueError(f"{name}: the bounds [{lower:g}, {upper:g}] do not hold the nominal value {nominal:g}")
-        size: float | Callable[[Scales], float] = 0.1 * abs(nominal) if nominal else how.size
-        # An instance has its own parameter, with the model's value as its null.
-        self.parameters = (Parameter(name, how.unit, size, lower, upper, nominal),)  # type: ignore[misc]
-        self.nominal = nominal
+        self._take(name, nominal, lower, upper)
         super().__init__("")
+
+    def _take(self, name: str, nominal: float, lower: float, upper: float) -> None:
+        """An instance has its own parameter, with the model's value as its null."""
+        size: float | Callable[[Scales], float] = 0.1 * abs(nominal) if nominal else self._how.size
+        self.parameters = (Parameter(name, self._how.unit, size, lower, upper, nominal),)  # type: ignore[misc]
+        self.nominal = nominal
+
+    def __getstate__(self) -> dict[str, Any]:
+        # How it is read and written is a function, which does not pickle.
+        kept = {name: value for name, value in vars(self).items() if name not in ("_how", "parameters")}
+        return {**kept, "parameter": (self.label, self.nominal, self.parameters[0].lower, self.parameters[0].upper)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        parameter = state.pop("parameter")
+        vars(self).update(state)
+        known = _OPTIONS if self.owner == "option" else _KINDS[self.owner]
+        self._how = known[parameter[0].rpartition(".")[2]]
+        self._take(*parameter)
 
     @property
     def label(self) -> str:

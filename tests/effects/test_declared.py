@@ -1,12 +1,14 @@
 """Declared parameters: their names, bounds, and what is said when they are wrong."""
 
+import pickle
+
 import mujoco
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_rpto.effects import Declared, declare, parameter_names
+from sb3_rpto.effects import Declared, Scales, declare, parameter_names
 from sb3_rpto.effects.world import BatchWorld, LiveWorld, World
 
 MODEL = mujoco.MjModel.from_xml_string("""
@@ -187,3 +189,20 @@ def test_the_range_of_a_joint_keeps_the_reference_pose_or_the_bound_next_to_it()
     np.testing.assert_allclose(double[:3], [(-2, 1), (0.4, 1.6), (0, 4)])
     with pytest.raises(ValueError, match=r"free\.range is 0 in the model"):
         Declared(model, "free.range")
+
+
+@pytest.mark.parametrize("name", ["hinge.damping", "body:shared.mass", "option.gravity", "hinge.stiffness"])
+def test_it_pickles(name: str) -> None:
+    (known,) = declare(MODEL, [name])
+    moved = known.with_values(known.values + 0.1)
+    twin = pickle.loads(pickle.dumps(moved))
+    assert repr(twin) == repr(moved)
+    assert (twin.parameters[0].size_for(Scales()), twin.nominal) == (
+        moved.parameters[0].size_for(Scales()),
+        known.nominal,
+    )
+    worlds = BatchWorld(MODEL, 1, 1), BatchWorld(MODEL, 1, 1)
+    for effect, world in zip((moved, twin), worlds):
+        effect.write(world, effect.values[None])
+    for field in ("dof_damping", "body_mass", "opt.gravity", "jnt_stiffness"):
+        np.testing.assert_array_equal(worlds[0].field(field), worlds[1].field(field))
