@@ -191,7 +191,7 @@ def test_drag_does_not_jump_with_the_length() -> None:
     """A capsule is a body of revolution: which of its principal frames is taken decides on MuJoCo's drag."""
     model = mujoco.MjModel.from_xml_path(str(ASSETS / "swimmer.xml"))
     accelerations = []
-    for scale in (1.0, 1 + 1e-9):
+    for scale in (0.87, 0.8703, 0.87035):  # at 0.8703 rounding turns the frame that an eigensolver finds
         stretched, data = model.__copy__(), mujoco.MjData(model)
         world = LiveWorld(stretched, data)
         for body in (1, 2, 3):
@@ -200,4 +200,4 @@ def test_drag_does_not_jump_with_the_length() -> None:
         data.qvel[:] = np.random.default_rng(0).normal(size=model.nv)
         mujoco.mj_forward(stretched, data)
         accelerations.append(data.qacc.copy())
-    np.testing.assert_allclose(*accelerations, rtol=1e-6)
+    np.testing.assert_allclose(accelerations[1:], accelerations[:1] * 2, atol=0.01)
