@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import pathlib
 import time
 from collections.abc import Callable, Collection
 from typing import Any
 
-import gymnasium as gym
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_rpto.algorithms import RPO, RPTO, RTO
+from sb3_rpto.experiments.baselines import fine_tuned_sac as fine_tuned_sac
+from sb3_rpto.experiments.methods import REGISTRY, MakeEnv, Run
 
-MakeEnv = Callable[[], gym.Env]
-ALGORITHMS = {"rpo": RPO, "rto": RTO, "rpto": RPTO}
-METHODS = ("zero-shot", "sac", "sac-warm", *ALGORITHMS)
+METHODS = tuple(REGISTRY)
 #: Evaluation environments are seeded apart from both worlds.
 EVALUATION_SEED = 50_000
 
@@ -38,6 +35,8 @@ class LearningCurve(BaseCallback):
     :param n_episodes: episodes of an evaluation
     :param seed: of the evaluation's initial states
     :param read: further values of a row, read off the model (an estimated parameter, say)
+    :param after_update: evaluate when the update that follows the step is over, as a method must be that learns from
+        many steps at once
     """
 
     def __init__(
@@ -47,14 +46,18 @@ class LearningCurve(BaseCallback):
         n_episodes: int = 10,
         seed: int = 0,
         read: Callable[[Any], dict[str, Any]] | None = None,
+        after_update: bool = False,
     ) -> None:
         super().__init__()
         self.env = make_vec_env(make_target, n_envs=n_episodes)
         self.every, self.n_episodes, self.seed = every, n_episodes, seed
-        self.read = read
+        self.read, self.after_update = read, after_update
         self.rows: list[dict[str, Any]] = []
+        #: source steps beside those that the model counts itself
+        self.source_steps = 0
         self._spent = 0.0  # seconds of training, without the evaluations
         self._since = 0.0
+        self._due: int | None = None  # steps of an evaluation that waits for the update
 
     def evaluate(self, model: SAC, steps: int) -> None:
         """Add a row."""
@@ -62,23 +65,50 @@ class LearningCurve(BaseCallback):
             "steps": steps,
             "return": evaluate(model, self.env, self.n_episodes, self.seed),
             "updates": model._n_updates - self._updates_at_start,
-            "source_steps": getattr(model, "source_timesteps", 0),
+            "source_steps": self.source_steps + getattr(model, "source_timesteps", 0),
             "seconds": round(self._spent, 2),
         }
         self.rows.append({**row, **(self.read(model) if self.read else {})})
 
-    def _on_training_start(self) -> None:
-        self._updates_at_start = self.model._n_updates
-        self.evaluate(self.model, 0)  # type: ignore[arg-type]
+    def begin(self, model: SAC) -> None:
+        """The row of the policy as it comes, before the first target step."""
+        self._updates_at_start = model._n_updates
+        self.evaluate(model, 0)
         self._since = time.perf_counter()
 
+    def finish(self, model: SAC, steps: int) -> None:
+        """The last row is that of another model, which was made after the last of ``steps`` target steps."""
+        if self.rows[-1]["steps"] == steps:
+            del self.rows[-1]
+        self._pause_and_evaluate(model, steps)
+
+    def _pause_and_evaluate(self, model: SAC, steps: int) -> None:
+        self._spent += time.perf_counter() - self._since
+        self.evaluate(model, steps)
+        self._since = time.perf_counter()
+
+    def _on_training_start(self) -> None:
+        self.begin(self.model)  # type: ignore[arg-type]
+
+    def _on_rollout_start(self) -> None:
+        self._evaluate_due()
+
     def _on_step(self) -> bool:
+        self._evaluate_due()
         steps, every = self.num_timesteps, self.every
         if steps % every == 0 if isinstance(every, int) else steps in every:
-            self._spent += time.perf_counter() - self._since
-            self.evaluate(self.model, self.num_timesteps)  # type: ignore[arg-type]
-            self._since = time.perf_counter()
+            self._due = steps
+            if not self.after_update:
+                self._evaluate_due()
         return True
+
+    def _on_training_end(self) -> None:
+        self._evaluate_due()
+
+    def _evaluate_due(self) -> None:
+        if self._due is not None:
+            steps, self._due = self._due, None
+            self._pause_and_evaluate(self.model, steps)  # type: ignore[arg-type]
 
 
 def transfer(
@@ -107,42 +137,15 @@ def transfer(
     :param seed: of the run
     :param n_episodes: episodes of an evaluation
     :param n_source_envs: source environments that step side by side
-    :param source_data: transitions of the source, for phi_0 (RTO, RPTO)
+    :param source_data: transitions of the source, for the methods that use some (phi_0, cloning, mixed batches)
     :param read: further values of a row
-    :param kwargs: constructor arguments of the method
+    :param kwargs: arguments of the method: of its constructor, or see :mod:`~sb3_rpto.experiments.methods`
     :return: one row an evaluation: method, seed, steps, return, updates, source_steps, seconds
     """
     if method not in METHODS:
         raise ValueError(f"method={method!r} does not exist; choose one of {METHODS}")
-    curve = LearningCurve(make_target, every, n_episodes, seed, read)
-    model: SAC
-    if method in ALGORITHMS:
-        source = make_vec_env(make_source, n_envs=n_source_envs)
-        if method != "rpo":
-            kwargs["source_data"] = source_data
-        model = ALGORITHMS[method].from_source(source_model, source, make_target(), seed=seed, device="cpu", **kwargs)
-    elif method == "sac":
-        model = SAC("MlpPolicy", make_target(), seed=seed, device="cpu", **kwargs)
-    else:
-        model = fine_tuned_sac(source_model, make_target(), seed, **kwargs)
-    if method == "zero-shot":
-        curve._updates_at_start = model._n_updates
-        curve.evaluate(model, 0)
-    else:
-        model.learn(budget, callback=curve)
+    chosen = REGISTRY[method]
+    curve = LearningCurve(make_target, every, n_episodes, seed, read, after_update=chosen.in_batches)
+    chosen.run(Run(source_model, make_source, make_target, budget, seed, n_source_envs, source_data, kwargs), curve)
     curve.env.close()
     return [{"method": method, "seed": seed, **row} for row in curve.rows]
-
-
-def fine_tuned_sac(source_model: str | pathlib.Path, target: gym.Env, seed: int, **settings: Any) -> SAC:
-    """SAC-warm: the source's SAC, ready to go on in the target from its first step, with an empty replay buffer.
-
-    :param source_model: zip of the SAC that was trained in the source
-    :param target: the target
-    :param seed: of the run
-    :param settings: attributes to change, e.g. ``gradient_steps``
-    """
-    model = SAC.load(source_model, env=target, device="cpu", **settings)
-    model.set_random_seed(seed)
-    model.learning_starts = 0
-    return model

@@ -1,0 +1,223 @@
+"""Baselines that are SAC or TRPO with another start, other data or another simulator."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms.distil import SquashedMeanPolicy, clone, clone_kwargs
+from sb3_rpto.algorithms.regression import regress
+from sb3_rpto.algorithms.source import EpisodeSource, make_source_world
+from sb3_rpto.algorithms.update import as_transitions
+from sb3_rpto.algorithms.worlds import check_spaces
+from sb3_rpto.buffers import DualReplayBuffer, World, chronological, load_transitions
+from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics
+
+#: Gradient steps of each critic that is added to a source model's two.
+CRITIC_STEPS = 2_000
+
+
+def fine_tuned_sac(source_model: str | pathlib.Path, target: GymEnv, seed: int, **settings: Any) -> SAC:
+    """SAC-warm: the source's SAC, ready to go on in the target from its first step, with an empty replay buffer.
+
+    :param source_model: zip of the SAC that was trained in the source
+    :param target: the target
+    :param seed: of the run
+    :param settings: attributes to change, e.g. ``gradient_steps``
+    """
+    model = SAC.load(source_model, env=target, device="cpu", **settings)
+    model.set_random_seed(seed)
+    model.learning_starts = 0
+    return model
+
+
+def source_transitions(
+    source_model: str | pathlib.Path, source: gym.Env, seed: int, source_data: Any = None
+) -> tuple[dict[str, np.ndarray], int]:
+    """Transitions of the source, for methods that need some: those given, else fresh ones of the source policy.
+
+    :param source_model: zip of the SAC that was trained in the source
+    :param source: the source
+    :param seed: of the run
+    :param source_data: recorded transitions, as :func:`~sb3_rpto.buffers.load_transitions` takes them
+    :return: arrays as :func:`~sb3_rpto.buffers.chronological` gives them, and how many source steps they cost now
+    """
+    if source_data is not None:
+        return load_transitions(source_data), 0
+    recorder = fine_tuned_sac(source_model, source, seed, gradient_steps=0).learn(warm.PHI_0_STEPS)
+    assert recorder.replay_buffer is not None  # learn() has filled it
+    return chronological(recorder.replay_buffer), warm.PHI_0_STEPS
+
+
+# ---------------------------------------------------------------------- many updates
+
+
+def with_more_critics(
+    source_model: str | pathlib.Path, target: gym.Env, seed: int, n_critics: int, data: dict[str, np.ndarray]
+) -> SAC:
+    """SAC-warm with more critics than the source model had, as methods with many updates a step use them.
+
+    The source's critics are taken over. Each further one starts at random and is regressed on one of them: copies
+    would stay equal for ever.
+
+    :param source_model: zip of the SAC that was trained in the source
+    :param target: the target
+    :param seed: of the run
+    :param n_critics: how many there shall be, at least as many as there are
+    :param data: source transitions
+    :raises ValueError: for fewer critics than the source model has
+    """
+    source = fine_tuned_sac(source_model, target, seed)
+    old = source.critic.q_networks
+    if n_critics < len(old):
+        raise ValueError(f"n_critics must be at least the source model's {len(old)}, got {n_critics}")
+    settings = {**warm.carried_arguments(source), "learning_starts": 0, "seed": seed, "device": "cpu"}
+    settings["policy_kwargs"] = {**settings["policy_kwargs"], "n_critics": n_critics}
+    model = SAC("MlpPolicy", target, **settings)
+    model.actor.load_state_dict(source.actor.state_dict())
+    if model.log_ent_coef is not None and source.log_ent_coef is not None:
+        model.log_ent_coef.data.copy_(source.log_ent_coef.data)
+    inputs = th.as_tensor(np.concatenate([data["observations"], data["actions"]], axis=1)).float()
+    for i, network in enumerate(model.critic.q_networks):
+        teacher = old[i % len(old)]
+        if i < len(old):
+            network.load_state_dict(teacher.state_dict())
+            continue
+        with th.no_grad():
+            goals = teacher(inputs)
+        regress(network, th.optim.Adam(network.parameters(), lr=1e-3), inputs, goals, CRITIC_STEPS)
+    model.critic_target.load_state_dict(model.critic.state_dict())
+    return model
+
+
+# ---------------------------------------------------------------------- mixed buffers
+
+
+class MixedReplayBuffer(DualReplayBuffer):
+    """Each batch is half of the source, half of the target; the odd one is the target's."""
+
+    def sample(
+        self, batch_size: int, env: VecNormalize | None = None, world: World | None = None
+    ) -> ReplayBufferSamples:
+        """Draw from both worlds, or from one.
+
+        :param batch_size: transitions
+        :param env: as in SB3
+        :param world: None: half and half
+        """
+        if world is not None:
+            return super().sample(batch_size, env, world)
+        source = super().sample(batch_size // 2, env, "source")
+        target = super().sample(batch_size - batch_size // 2, env, "target")
+        return ReplayBufferSamples(*(th.cat(pair) for pair in zip(source[:5], target[:5])))
+
+
+def mixed_sac(
+    source_model: str | pathlib.Path, target: gym.Env, seed: int, data: dict[str, np.ndarray], **settings: Any
+) -> SAC:
+    """SAC-warm that learns from source and target transitions half and half.
+
+    :param source_model: zip of the SAC that was trained in the source
+    :param target: the target
+    :param seed: of the run
+    :param data: source transitions
+    :param settings: attributes to change
+    """
+    model = fine_tuned_sac(source_model, target, seed, **settings)
+    check_spaces(model.observation_space, model.action_space)
+    assert isinstance(model.observation_space, spaces.Box)  # as just checked
+    assert isinstance(model.action_space, spaces.Box)
+    buffer = MixedReplayBuffer(len(data["rewards"]), model.observation_space, model.action_space, model.device)
+    arrays = {name: array for name, array in data.items() if name != "terminations"}
+    buffer.append("source", dones=data["terminations"], **arrays)
+    model.replay_buffer = buffer
+    return model
+
+
+# ---------------------------------------------------------------------- TRPO
+
+
+def rollout_length(budget: int, longest: int) -> int:
+    """Steps of a TRPO rollout: at most ``longest``, and so that whole rollouts make up the budget.
+
+    :param budget: target steps
+    :param longest: what is wanted
+    :return: the largest divisor of the budget that fits and is above 1, else the budget itself
+    """
+    return max((n for n in range(2, min(longest, budget) + 1) if budget % n == 0), default=budget)
+
+
+def cloned_trpo(
+    source_model: str | pathlib.Path, target: gym.Env, seed: int, budget: int, states: np.ndarray, **settings: Any
+) -> Any:
+    """TRPO-warm: ``sb3_contrib.TRPO`` that starts from a clone of the source's SAC policy.
+
+    :param source_model: zip of the SAC that was trained in the source
+    :param target: the target
+    :param seed: of the run
+    :param budget: target steps, a multiple of ``n_steps``; by default 2048, for small budgets a quarter
+    :param states: of the source, (n, observation_dim)
+    :param settings: arguments of TRPO
+    :raises ValueError: for a budget that is no multiple of ``n_steps``: TRPO would overspend it
+    """
+    from sb3_contrib import TRPO  # an extra
+
+    teacher = SAC.load(source_model, device="cpu")
+    n_steps = settings.pop("n_steps", None) or rollout_length(budget, min(2048, max(budget // 4, 2)))
+    if budget % n_steps:
+        raise ValueError(f"n_steps={n_steps} must divide the budget of {budget} target steps, or TRPO overspends it")
+    defaults = {
+        "gamma": teacher.gamma,
+        "batch_size": rollout_length(n_steps, 128),
+        "policy_kwargs": clone_kwargs(teacher),
+    }
+    model = TRPO(SquashedMeanPolicy, target, n_steps=n_steps, seed=seed, device="cpu", **{**defaults, **settings})
+    clone(model.policy, teacher, states)
+    return model
+
+
+# ---------------------------------------------------------------------- identify, then retrain
+
+
+def identified_source(
+    recorded: ReplayBuffer,
+    recorder: SAC,
+    source: VecEnv,
+    declared: Sequence[str],
+    seed: int,
+    max_steps: int = 100,
+    dynamics_kwargs: dict[str, Any] | None = None,
+) -> tuple[VecEnv, dict[str, float]]:
+    """The source simulator with its declared numbers fitted to target transitions, once.
+
+    :param recorded: target transitions
+    :param recorder: whose actions they hold
+    :param source: the source
+    :param declared: names of the numbers, as ``dynamics="physical"`` takes them
+    :param seed: of the run
+    :param max_steps: of the fit
+    :param dynamics_kwargs: further arguments of the physical model
+    :return: environments to train in, and what was found
+    """
+    # The fit is no curriculum here: it may go all the way at once.
+    config = dynamics_config("physical", source, {"max_step": 0.1, **(dynamics_kwargs or {})}, declared)
+    observation_space, action_space = recorder.observation_space, recorder.action_space
+    assert isinstance(observation_space, spaces.Box)  # dynamics_config would have refused the source
+    assert isinstance(action_space, spaces.Box)
+    dynamics = make_dynamics(config, observation_space, action_space)
+    dynamics.seed(seed)
+    dynamics.fit(as_transitions(chronological(recorded), recorder.policy, recorder.device), max_steps=max_steps)
+    world = make_source_world(source, dynamics, "source", 1)
+    assert isinstance(world, EpisodeSource)  # physical models are rolled out in whole episodes
+    return world.env, dynamics.describe()

@@ -1,0 +1,177 @@
+"""Every method by its name: how it is built and run, and how many updates a target step its authors take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_rpto.algorithms import RPO, RPTO, RTO
+from sb3_rpto.algorithms.mbpo import MBPO
+from sb3_rpto.algorithms.pdml import PDML
+from sb3_rpto.algorithms.ptp import PTP
+from sb3_rpto.algorithms.slbo import SLBO
+from sb3_rpto.algorithms.transfer import TransferAlgorithm
+from sb3_rpto.experiments import baselines
+from sb3_rpto.presets import resolve_preset
+
+if TYPE_CHECKING:
+    from sb3_rpto.experiments.run import LearningCurve
+
+MakeEnv = Callable[[], gym.Env]
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a method is given; see :func:`~sb3_rpto.experiments.run.transfer`."""
+
+    source_model: str
+    make_source: MakeEnv
+    make_target: MakeEnv
+    budget: int
+    seed: int = 0
+    n_source_envs: int = 1
+    source_data: str | None = None
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+    def source_id(self) -> str | None:
+        """The source's id, None where it has none."""
+        env = self.make_source()
+        env_id = None if env.spec is None else env.spec.id
+        env.close()
+        return env_id
+
+    def source_transitions(self, curve: LearningCurve) -> dict[str, Any]:
+        """Transitions of the source; what fresh ones cost is in the curve's source steps."""
+        data, spent = baselines.source_transitions(self.source_model, self.make_source(), self.seed, self.source_data)
+        curve.source_steps += spent
+        return data
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method of the harness.
+
+    :param run: spends exactly the budget of target steps and leaves the curve's rows
+    :param updates: published updates per target step of a task (its id, or None), of policy or critic
+    :param in_batches: learns from many target steps at once, so that it is evaluated after it has
+    """
+
+    run: Callable[[Run, LearningCurve], None]
+    updates: Callable[[str | None], float]
+    in_batches: bool = False
+
+
+def _zero_shot(run: Run, curve: LearningCurve) -> None:
+    curve.begin(baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, **run.kwargs))
+
+
+def _two_worlds(cls: type[TransferAlgorithm], run: Run, curve: LearningCurve) -> None:
+    source, kwargs = make_vec_env(run.make_source, n_envs=run.n_source_envs), dict(run.kwargs)
+    if cls.updates_dynamics:
+        kwargs["source_data"] = run.source_data
+    model = cls.from_source(run.source_model, source, run.make_target(), seed=run.seed, device="cpu", **kwargs)
+    model.learn(run.budget, callback=curve)
+
+
+def _slbo(run: Run, curve: LearningCurve) -> None:
+    stage = min(SLBO.NUMBERS["model_train_freq"], max(run.budget // 4, 1))
+    _two_worlds(SLBO, Run(**{**vars(run), "kwargs": {"model_train_freq": stage, **run.kwargs}}), curve)
+
+
+def _sac(run: Run, curve: LearningCurve) -> None:
+    SAC("MlpPolicy", run.make_target(), seed=run.seed, device="cpu", **run.kwargs).learn(run.budget, callback=curve)
+
+
+def _sac_warm(run: Run, curve: LearningCurve) -> None:
+    model = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, **run.kwargs)
+    model.learn(run.budget, callback=curve)
+
+
+def _sac_warm_high(run: Run, curve: LearningCurve) -> None:
+    settings = {"gradient_steps": int(_rpto_updates(run.source_id())), **run.kwargs}
+    n_critics = settings.pop("n_critics", None)
+    if n_critics is None:
+        model = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, **settings)
+    else:
+        data = run.source_transitions(curve)
+        model = baselines.with_more_critics(run.source_model, run.make_target(), run.seed, n_critics, data)
+        for name, value in settings.items():
+            setattr(model, name, value)
+    model.learn(run.budget, callback=curve)
+
+
+def _sac_mixed(run: Run, curve: LearningCurve) -> None:
+    data = run.source_transitions(curve)
+    model = baselines.mixed_sac(run.source_model, run.make_target(), run.seed, data, **run.kwargs)
+    model.learn(run.budget, callback=curve)
+
+
+def _trpo_warm(run: Run, curve: LearningCurve) -> None:
+    states = run.source_transitions(curve)["observations"]
+    model = baselines.cloned_trpo(run.source_model, run.make_target(), run.seed, run.budget, states, **run.kwargs)
+    model.learn(run.budget, callback=curve)
+
+
+def _sysid_retrain(run: Run, curve: LearningCurve) -> None:
+    settings = dict(run.kwargs)
+    declared, retrain_steps = settings.pop("declared", ()), settings.pop("retrain_steps", 20_000)
+    identification = {name: settings.pop(name) for name in ("max_steps", "dynamics_kwargs") if name in settings}
+    if not declared:
+        raise ValueError("sysid-retrain needs declared=[...], the names of the simulator's numbers to identify")
+    recorder = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, gradient_steps=0)
+    recorder.learn(run.budget, callback=curve)
+    assert recorder.replay_buffer is not None  # learn() has filled it
+    source = make_vec_env(run.make_source, n_envs=1)
+    simulator, _ = baselines.identified_source(
+        recorder.replay_buffer, recorder, source, declared, run.seed, **identification
+    )
+    model = baselines.fine_tuned_sac(run.source_model, simulator, run.seed, **settings)
+    model.learn(retrain_steps)
+    curve.source_steps += retrain_steps
+    curve.finish(model, run.budget)
+
+
+def _rpto_updates(env_id: str | None) -> float:
+    return resolve_preset("default", "ensemble", env_id, ())["gradient_steps"]
+
+
+def _rpo_updates(env_id: str | None) -> float:
+    return resolve_preset("default", "real", env_id, ())["gradient_steps"]
+
+
+def _published(cls: type[MBPO], env_id: str | None) -> float:
+    return cls.published(env_id)["gradient_steps"]
+
+
+def _slbo_updates(env_id: str | None) -> float:
+    return 20 * 40 / SLBO.published(env_id)["model_train_freq"]
+
+
+def _number(updates: float) -> Callable[[str | None], float]:
+    return lambda env_id: updates
+
+
+#: All methods, by the names of the command line.
+REGISTRY: dict[str, Method] = {
+    "zero-shot": Method(_zero_shot, _number(0)),
+    "rpo": Method(partial(_two_worlds, RPO), _rpo_updates),
+    "rto": Method(partial(_two_worlds, RTO), _rpto_updates),
+    "rpto": Method(partial(_two_worlds, RPTO), _rpto_updates),
+    "sac": Method(_sac, _number(1)),
+    "sac-warm": Method(_sac_warm, _number(1)),
+    "sac-warm-high": Method(_sac_warm_high, _rpto_updates),
+    "sac-mixed": Method(_sac_mixed, _number(1)),
+    "trpo-warm": Method(_trpo_warm, _number(1 / 2048), in_batches=True),
+    "mbpo": Method(partial(_two_worlds, MBPO), partial(_published, MBPO)),
+    "slbo": Method(_slbo, _slbo_updates, in_batches=True),
+    "ptp": Method(partial(_two_worlds, PTP), partial(_published, PTP)),
+    "pdml": Method(partial(_two_worlds, PDML), partial(_published, PDML)),
+    "sysid-retrain": Method(_sysid_retrain, _number(0), in_batches=True),
+    "oracle": Method(_sac_warm, _number(1)),
+}
