@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import mujoco
@@ -261,3 +262,19 @@ def test_twice_the_range_is_registered_where_every_joint_stays_within_half_a_tur
             model = gym.make(env_id(task), shift="joint-range-x2").unwrapped.model
             limited = (model.jnt_limited == 1) & (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
             assert (np.abs(model.jnt_range[limited]).max() <= np.pi) == (2.0 in known.levels["joint-range"]), task
+
+
+# --- the docs ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_tables_of_the_docs_are_the_registry():
+    lines = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text().splitlines()
+    kinds = ["gravity", "friction", "joint-range", "limb"]
+    for name, known in TASKS.items():
+        levels = [", ".join(f"x{factor:g}" for factor in known.levels.get(kind, ())) for kind in kinds]
+        row = f"| `{name}` | target0 to target3 | {' | '.join(levels)} |"
+        assert row.replace("|  |", "| |").replace("|  |", "| |") in lines
+        env = gym.make(env_id(name))
+        sizes = (env.observation_space.shape[0], env.action_space.shape[0], known.max_episode_steps)
+        (line,) = [line for line in lines if line.startswith(f"| `{name}` | ") and line.endswith(f"| {sizes[2]:,} |")]
+        assert line.endswith(f" | {sizes[0]} | {sizes[1]} | {sizes[2]:,} |")
