@@ -264,7 +264,7 @@ def test_twice_the_range_is_registered_where_every_joint_stays_within_half_a_tur
             assert (np.abs(model.jnt_range[limited]).max() <= np.pi) == (2.0 in known.levels["joint-range"]), task
 
 
-# --- the docs ----------------------------------------------------------------------------------------------------------
+# --- the docs ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_tables_of_the_docs_are_the_registry():
