@@ -50,7 +50,8 @@ METHOD = (
     "All candidates that could show were fitted together, then dropped one by one: first the one whose loss costs "
     "least on the select windows, until all that remained were needed.",
     "An effect is needed when its loss raises the log error of blocks of select windows clearly (t above the "
-    "threshold) and by more than 3 %. Like effects were then tried in its place: those that do as well form its class.",
+    "threshold) and by more than 3 %; far from the noise, where other missing effects spread the blocks, a t of 2 is "
+    "enough and a tenth is needed. Like effects were then tried in its place: those that do as well form its class.",
     "The kept effects and the declared parameters were fitted once more to train and select runs; their intervals "
     "come from resampling blocks of windows.",
     "Errors, missing forces and the curves above are those of the test runs, where there are any.",

@@ -18,6 +18,10 @@ from sb3_rpto.tracing.windows import Windows
 THRESHOLD = 3.5
 #: Effects must lower the typical window error by this share to stay.
 GAIN = 0.03
+#: Typical window error, in units of the noise, above which it is the model's more than the noise's; t* and gain there.
+#: What else lacks, not the noise, then spreads the blocks, so a t beyond the 98 % quantile of one test is the best
+#: evidence there is; and of the many effects that would fit a little of what lacks, those that take a tenth are named.
+FAR, LIKELY, TENTH = 2.0, 2.0, 0.1
 #: Iterations of a refit that begins at the larger model's optimum.
 REFIT = 5
 #: Iterations of the joint fit of all candidates.
@@ -30,9 +34,8 @@ FOLDS = 6
 SEEMS = 1.5
 #: Rounds of the look forward, and candidates fitted in each.
 ROUNDS, PROMISING = 3, 4
-#: Pairs of kept effects in whose place one is tried, and the typical window error, in units of the noise, up to which
-#: that is worth its time: where much is missing, neither the two nor the one are right.
-MERGES, MERGEABLE = 3, 2.0
+#: Pairs of kept effects in whose place one is tried.
+MERGES = 3
 #: Typical window error, in units of the noise, that leaves nothing to look forward to.
 ENOUGH = 1.1
 #: Candidates for a substitution are the likest so many, of at least this cosine.
@@ -57,14 +60,14 @@ class Evidence:
     t: float
     blocks: np.ndarray
 
-    def clear(self, threshold: float) -> bool:
+    def clear(self, threshold: float, gain: float = GAIN) -> bool:
         """Whether the gain is more than chance and more than a trifle."""
-        return self.t > threshold and self.gain > GAIN
+        return self.t > threshold and self.gain > gain
 
-    def frequency(self, threshold: float, rng: np.random.Generator, resamples: int = 200) -> float:
-        """Share of resampled sets of blocks in which the gain is clear."""
+    def frequency(self, limit: tuple[float, float], rng: np.random.Generator, resamples: int = 200) -> float:
+        """Share of resampled sets of blocks in which the gain is clear by a limit of t and gain."""
         n = len(self.blocks)
-        found = [_evidence(self.blocks[rng.integers(n, size=n)]).clear(threshold) for _ in range(resamples)]
+        found = [_evidence(self.blocks[rng.integers(n, size=n)]).clear(*limit) for _ in range(resamples)]
         return float(np.mean(found))
 
 
@@ -242,8 +245,19 @@ class Selector:
         """What ``with_`` gains over ``without`` on windows that neither was fitted to."""
         return compare(without.errors, with_.errors, self.blocks)
 
-    def eliminate(self, outcome: Selection, limit: float) -> Selection:
-        """Drop the effect whose removal costs least until all that remain have a t above the limit."""
+    def far(self, model: Model) -> bool:
+        """Whether what a model lacks, and not the noise, makes its errors."""
+        return bool(np.median(model.errors) > FAR)
+
+    def limit(self, model: Model) -> tuple[float, float]:
+        """The t and the gain that an effect of a model must exceed to stay."""
+        return (min(LIKELY, self.threshold), TENTH) if self.far(model) else (self.threshold, GAIN)
+
+    def eliminate(self, outcome: Selection, limit: float | None = None) -> Selection:
+        """Drop the effect whose removal costs least until all that remain have a t above the limit.
+
+        :param limit: default: :meth:`limit` of the model, with its gain
+        """
         current, step = outcome.model, max((step for step, _ in outcome.dropped.values()), default=0)
         while current.effects:
             step += 1
@@ -254,7 +268,7 @@ class Selector:
                 trial = self.model([e for e in current.effects if e not in drop], current.fit)
                 evidence = self.evidence(current, trial)
                 self.say(f"{len(trial.effects)} effects left")
-                if not evidence.clear(limit):
+                if not evidence.clear(*(self.limit(current) if limit is None else (limit,))):
                     reduced = trial
                     for e in drop:
                         outcome.dropped[e] = (step, evidence)
@@ -307,9 +321,12 @@ class Selector:
         return selection
 
     def merge(self, selection: Selection, screening: Screening) -> Selection:
-        """Try one effect in the place of two: the joint fit may have met its like by a mixture."""
+        """Try one effect in the place of two: the joint fit may have met its like by a mixture.
+
+        Far from the noise it is not worth its time: neither the two nor the one are right.
+        """
         current = selection.model
-        if np.median(current.errors) > MERGEABLE:
+        if self.far(current):
             return selection
         pairs = sorted(combinations(current.effects, 2), key=lambda pair: -screening.cosine[pair])[:MERGES]
         for pair in pairs:
@@ -391,13 +408,14 @@ class Selector:
 
     def judge(self, selection: Selection) -> Selection:
         """Evidence for each kept effect against the model without it; what is not clear goes."""
+        selection = self.eliminate(selection)
         while True:
             current = selection.model
             selection.evidence = {}
             for e in current.effects:
                 without = self.model([i for i in current.effects if i != e], current.fit, REFIT + 3)
                 selection.evidence[e] = self.evidence(current, without)
-            weak = [e for e, evidence in selection.evidence.items() if not evidence.clear(self.threshold)]
+            weak = [e for e, evidence in selection.evidence.items() if not evidence.clear(*self.limit(current))]
             if not weak:
                 selection.alike = {e: found for e, found in selection.alike.items() if e in current.effects}
                 return selection
@@ -419,7 +437,7 @@ class Selector:
                 self.say(f"looking at {self.simulation.effects[e].label} again")
                 trial = self.model([*current.effects, e], current.fit, REFIT + 3)
                 evidence = self.evidence(trial, current)
-                if evidence.clear(self.threshold):
+                if evidence.clear(*self.limit(trial)):
                     tried.append((evidence.gain, trial, e))
             if not tried:
                 break

@@ -126,7 +126,7 @@ def trace(
     return Report(
         verdict=judge(first, last, bool(selection.model.effects)),
         declared=_declared(simulation, final, intervals),
-        effects=_kept(selection, simulation, final, intervals, selector.threshold, seed),
+        effects=_kept(selection, simulation, final, intervals, selector.limit(selection.model), seed),
         candidates=_fates(simulation, screening, selection),
         adequacy_before=first,
         adequacy_after=last,
@@ -144,7 +144,7 @@ def trace(
             name: sorted({e.run for e in part.episodes})
             for name, part in (("train", train), ("select", select), ("test", test))
         },
-        threshold=selector.threshold,
+        threshold=selector.limit(selection.model)[0],
         horizon=horizon,
         seed=seed,
         # An environment may hold other numbers than its file, which the specification would lose.
@@ -212,7 +212,7 @@ def search(selector: Selector, rough: Selector, base: Model, screening: Screenin
     # What seems to matter stays while much else may still be wrong.
     selection = rough.eliminate(Selection(rough.together(chosen, rough.model((), base.fit).fit)), SEEMS)
     selection = rough.add_back(selection, chosen)
-    selection = rough.eliminate(selection, rough.threshold)
+    selection = rough.eliminate(selection)
     say(0.7, "trying like effects in their place")
     selection = rough.merge(rough.substitute(selection, screening), screening)
     selection.model = selector.model(selection.model.effects, selection.model.fit, iterations=10)
@@ -343,7 +343,7 @@ def _kept(
     simulation: Simulation,
     values: np.ndarray,
     intervals: np.ndarray,
-    threshold: float,
+    limit: tuple[float, float],
     seed: int,
 ) -> list[Traced]:
     """The effects that the model lacks, with their fitted values and the evidence for them."""
@@ -353,7 +353,7 @@ def _kept(
         evidence, s = selection.evidence[i], simulation.slices[i]
         alike = [simulation.effects[j].label for j in selection.alike.get(i, [])]
         effect = simulation.effects[i].with_values(values[s])
-        frequency = evidence.frequency(threshold, rng)
+        frequency = evidence.frequency(limit, rng)
         found.append(Traced(effect, intervals[:, s], alike, evidence.gain, evidence.t, frequency))
     return found
 

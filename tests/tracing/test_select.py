@@ -11,7 +11,7 @@ from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, ViscousFriction
 from sb3_rpto.tracing.screen import screen
-from sb3_rpto.tracing.select import GAIN, Evidence, Selection, Selector, compare, folds
+from sb3_rpto.tracing.select import FAR, GAIN, LIKELY, TENTH, Evidence, Selection, Selector, compare, folds
 from sb3_rpto.tracing.windows import cut
 
 THRESHOLD = 3.5
@@ -88,15 +88,15 @@ def test_errors_of_zero_are_compared_without_infinities() -> None:
 
 def test_frequency_is_the_share_of_resamples_that_are_clear() -> None:
     sure, never = np.full(20, 0.5), np.full(20, -0.1)
-    assert compare(np.exp(sure), np.ones(20), np.arange(20)).frequency(3.5, np.random.default_rng(0)) == 1
-    assert compare(np.exp(never), np.ones(20), np.arange(20)).frequency(3.5, np.random.default_rng(0)) == 0
+    assert compare(np.exp(sure), np.ones(20), np.arange(20)).frequency((3.5, GAIN), np.random.default_rng(0)) == 1
+    assert compare(np.exp(never), np.ones(20), np.arange(20)).frequency((3.5, GAIN), np.random.default_rng(0)) == 0
     noisy = np.linspace(-0.4, 1.1, 20)
     evidence = compare(np.exp(noisy), np.ones(20), np.arange(20))
     draws = noisy[np.random.default_rng(2).integers(20, size=(20000, 20))]
     t = draws.mean(1) / (draws.std(1, ddof=1) / np.sqrt(20))
     expected = np.mean((t > 3.5) & (1 - np.exp(-draws.mean(1)) > GAIN))
     assert 0.1 < expected < 0.9
-    found = evidence.frequency(3.5, np.random.default_rng(3), resamples=2000)
+    found = evidence.frequency((3.5, GAIN), np.random.default_rng(3), resamples=2000)
     assert found == pytest.approx(expected, abs=0.05)
 
 
@@ -135,9 +135,16 @@ def test_judging_drops_what_does_not_help() -> None:
     assert selection.model.effects == (COULOMB,)
     assert set(selection.evidence) == {COULOMB}
     assert selection.evidence[COULOMB].gain > 0.3
-    step, evidence = selection.dropped[DRAG]
-    assert step == 0
+    _, evidence = selection.dropped[DRAG]
     assert not evidence.clear(THRESHOLD)
+
+
+def test_near_the_noise_evidence_must_be_clearer_far_from_it_the_gain_larger() -> None:
+    s, kept = with_friction()
+    assert s.limit(kept.model) == (THRESHOLD, GAIN)
+    far = s.model((), kept.model.fit)
+    assert np.median(far.errors) > FAR
+    assert s.limit(far) == (LIKELY, TENTH)
 
 
 def test_looking_forward_brings_a_wrongly_dropped_effect_back() -> None:
