@@ -18,7 +18,7 @@ from sb3_rpto.dynamics.base import Dynamics, Prediction
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
-from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.stance import StandingEnv
 from sb3_rpto.envs.state import copy_env, restore_state, save_state
 
 RolloutStart = Literal["target", "source", "mix"]
@@ -167,7 +167,7 @@ class SimulatorSource(EpisodeSource):
     def __init__(self, dynamics: PhysicalDynamics, env: VecEnv, num_envs: int) -> None:
         dynamics.attach(env)
         self.dynamics = dynamics
-        self.copies = [CorrectedEnv(_copied(env), dynamics.effects()) for _ in range(num_envs)]
+        self.copies = [StandingEnv(_copied(env), dynamics.effects()) for _ in range(num_envs)]
         makers: list[Callable[[], gym.Env]] = [lambda copy=copy: copy for copy in self.copies]  # type: ignore[misc]
         stacked = DummyVecEnv(makers)
         # Copies of one environment would draw the same numbers.

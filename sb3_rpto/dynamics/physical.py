@@ -19,8 +19,9 @@ from sb3_rpto.dynamics.onestep import OneStep, Steps, as_steps, true_state
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.effect import from_json
 from sb3_rpto.effects.simulation import Drive
-from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.effects.wrapper import CorrectedEnv, beyond_model
 from sb3_rpto.envs.observations import StateMap, env_name, layers, mujoco_model, single_env, state_map
+from sb3_rpto.envs.stance import StandingEnv
 from sb3_rpto.envs.state import copy_env
 
 #: Fits use the newest transitions: a few numbers are known long before.
@@ -39,6 +40,12 @@ def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
     single = single_env(env)
     model, recover = mujoco_model(single), state_map(single)
     check_commands(single, "dynamics='physical'")
+    hidden = beyond_model(single)
+    if hidden:
+        raise ValueError(
+            f"{env_name(single)} has effects that are no numbers of its model ({', '.join(hidden)}), which phi would "
+            "lack; give the environment without them, and them as dynamics_kwargs={'effects': [...]}"
+        )
     frame_skip = getattr(single.unwrapped, "frame_skip", None)
     if frame_skip is None:
         raise ValueError(f"{env_name(single)} has no frame_skip; derive it from gymnasium.envs.mujoco.MujocoEnv")
@@ -231,7 +238,7 @@ class PhysicalDynamics(Dynamics):
         if twin is None:
             raise ValueError(f"{env} cannot be copied; give dynamics='physical' an environment that can")
         twin.reset(seed=0)
-        self._twin = CorrectedEnv(twin, self.effects())
+        self._twin = StandingEnv(twin, self.effects())
 
     @th.no_grad()
     def step(self, observations: th.Tensor, actions: th.Tensor, deterministic: bool = False) -> Prediction:

@@ -6,6 +6,7 @@ import gymnasium as gym
 
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.stance import StandingEnv
 from sb3_rpto.envs.state import copy_env
 
 
@@ -28,4 +29,4 @@ def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:
         raise ValueError(
             f"{env} holds what cannot be copied; make a new one and wrap it: CorrectedEnv(gym.make(...), effects)"
         )
-    return CorrectedEnv(twin, effects)
+    return StandingEnv(twin, effects)

@@ -25,7 +25,7 @@ Rule = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
 # Wrappers that pass observations, actions and rewards on unchanged; by name, since a subprocess tells no more.
 HARMLESS_WRAPPERS = {
     *("TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "Autoreset", "Monitor", "RecordEpisodeStatistics"),
-    *("RecordVideo", "RenderCollection", "HumanRendering", "DynamicsEnv", "CorrectedEnv", "ShiftedEnv"),
+    *("RecordVideo", "RenderCollection", "HumanRendering", "DynamicsEnv", "CorrectedEnv", "ShiftedEnv", "StandingEnv"),
 }
 # The action of the buffer is not the one that the task's reward sees; its termination does not mind.
 _CHANGES_ACTIONS = {"ClipAction", "RescaleAction"}

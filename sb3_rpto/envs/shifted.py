@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -15,7 +15,7 @@ from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect, from_json
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.shifts import EnvShift, as_shift, number_names
-from sb3_rpto.envs.stance import Stance
+from sb3_rpto.envs.stance import Stance, StandingEnv
 
 
 def shift_effects(shift: EnvShift, env: gym.Env) -> list[Effect]:
@@ -34,11 +34,8 @@ def shift_effects(shift: EnvShift, env: gym.Env) -> list[Effect]:
     return [*scaled.values(), *map(from_json, shift.effects)]  # type: ignore[arg-type]
 
 
-class ShiftedEnv(CorrectedEnv):
-    """A gymnasium MuJoCo environment with a shift, on its feet.
-
-    As :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`, and its start height and healthy heights follow its body
-    (:class:`~sb3_rpto.envs.stance.Stance`).
+class ShiftedEnv(StandingEnv):
+    """A gymnasium MuJoCo environment with a shift.
 
     :param env: one whose innermost environment has MuJoCo's ``model`` and ``data`` and steps them by ``do_simulation``;
         with effects or not
@@ -55,11 +52,6 @@ class ShiftedEnv(CorrectedEnv):
             raise ValueError(f"{type(base).__name__} is neither a gymnasium MuJoCo environment nor a cart-pole")
         self._stance = Stance(base)
         CorrectedEnv.__init__(self, env, shift_effects(shift, env))
-
-    def set_effects(self, effects: Sequence[Effect]) -> None:
-        """As in :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`; the walker stands on its feet at the next reset."""
-        super().set_effects(effects)
-        self._stance.take(self.unwrapped)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "shift": self.shift}

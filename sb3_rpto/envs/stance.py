@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+import gymnasium as gym
 import mujoco
 import numpy as np
+
+from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.wrapper import CorrectedEnv
 
 _FAR = 1e3  # m, farther than any robot's feet
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -43,6 +48,30 @@ class Stance:
             low, high = self._healthy
             scale = found[1] / self._height
             base._healthy_z_range = (low * scale, high * scale)
+
+
+class StandingEnv(CorrectedEnv):
+    """A gymnasium MuJoCo environment with effects, on its feet.
+
+    As :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`, and its start height and healthy heights follow its body
+    (:class:`Stance`) from the next reset on.
+
+    :param env: as there
+    :param effects: as there
+    :raises ValueError: as there
+    """
+
+    def __init__(self, env: gym.Env, effects: Sequence[Effect]) -> None:
+        self._stance = Stance(env.unwrapped)
+        super().__init__(env, effects)
+
+    def set_effects(self, effects: Sequence[Effect]) -> None:
+        """As in :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`; the walker stands on its feet at the next reset."""
+        super().set_effects(effects)
+        self._stance.take(self.unwrapped)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        StandingEnv.__init__(self, **state)
 
 
 def _vertical(model: mujoco.MjModel) -> int | None:

@@ -42,6 +42,22 @@ def pole():
 # --- what it is told of the environment -------------------------------------------------------------------------------
 
 
+def test_a_source_with_forces_of_its_own_is_refused():
+    corrected = apply_effects(gym.make(POLE), [CommandDelay("slide", delay=0.05)])
+    with pytest.raises(ValueError, match=r"command_delay\(slide\).*which phi would lack"):
+        physical_config(corrected)
+
+
+def test_the_walker_that_answers_stands_on_its_own_legs():
+    model = dynamics(HOPPER, ("leg.length",))
+    model.attach(gym.make(HOPPER))
+    base = model._twin.unwrapped
+    height, healthy = base.init_qpos[1], base._healthy_z_range[0]
+    model._twin.set_effects([e.with_values(1.2 * e.values) for e in model.effects()])
+    assert base.init_qpos[1] == pytest.approx(height + 0.2 * 0.5, abs=1e-6)
+    assert base._healthy_z_range[0] > healthy
+
+
 def test_the_config_is_plain_data_of_its_own():
     env = gym.make(HOPPER)
     config = physical_config(VecNormalize(DummyVecEnv([lambda: env])))

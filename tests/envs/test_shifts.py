@@ -312,7 +312,7 @@ def test_a_shift_and_a_correction_compose_in_either_order():
     one = Report.apply(report, shift.apply(source))
     other = shift.apply(Report.apply(report, source))
     np.testing.assert_equal(run(one), run(other))
-    assert [type(layer).__name__ for layer in corrections(one)] == ["CorrectedEnv", "ShiftedEnv"]
+    assert [type(layer).__name__ for layer in corrections(one)] == ["StandingEnv", "ShiftedEnv"]
     assert differs(one, shift.apply(source)).effects == ()  # dry friction is a number
     assert differs(one, apply_effects(source, [friction])).effects == ("command_delay(fshin)",)
 
