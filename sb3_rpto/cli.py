@@ -22,7 +22,7 @@ USER_ERRORS = (ValueError, TypeError, OSError, ImportError)
 #: Readers of recordings by the suffix of their files.
 FORMATS = {"csv": "from_csv", "parquet": "from_parquet", "npz": "from_npz"}
 #: Modules with ``main(arguments) -> exit code`` behind ``sb3-rpto benchmark NAME``.
-BENCHMARKS = {"tracing": "sb3_rpto.experiments.tracing_benchmark"}
+BENCHMARKS = {"speed": "sb3_rpto.experiments.speed", "tracing": "sb3_rpto.experiments.tracing_benchmark"}
 
 Commands = Any  # argparse's own type for a group of subcommands is private
 

@@ -14,6 +14,7 @@ from gymnasium import spaces
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
 from sb3_rpto.dynamics.networks import Heads, StackedNetworks
+from sb3_rpto.dynamics.products import fast_products
 
 #: a known rule of the task, in torch: (observations, actions, next_observations) -> (n,)
 TransitionFn: TypeAlias = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
@@ -162,11 +163,12 @@ class EnsembleDynamics(Dynamics):
         :param deterministic: the mean prediction instead of a sample
         """
         inputs = self._inputs(observations, actions)
-        if deterministic or not self.noise:
-            heads = self._ask_elites(inputs)
-            targets, ended = heads.mean.mean(dim=0), heads.logit.sigmoid().mean(dim=0) > 0.5
-        else:
-            targets, ended = self._sample(inputs)
+        with fast_products(self.device):
+            if deterministic or not self.noise:
+                heads = self._ask_elites(inputs)
+                targets, ended = heads.mean.mean(dim=0), heads.logit.sigmoid().mean(dim=0) > 0.5
+            else:
+                targets, ended = self._sample(inputs)
         targets = (targets * self.target_std + self.target_mean).to(observations.dtype)
         next_observations = observations + targets[:, :-1]
         given = observations, actions, next_observations
@@ -212,27 +214,30 @@ class EnsembleDynamics(Dynamics):
         max_steps = self.max_steps if max_steps is None else max_steps
         if max_steps < 1:
             raise ValueError(f"max_steps must be at least 1, got {max_steps}")
-        train, held = self._prepare(data, weights)
-        best_nll, best_error = self._judge(held)
-        mark, best_state = best_error, [p.detach().clone() for p in self.networks.parameters()]
-        steps, epochs, stale, train_nll = 0, 0, 0, math.nan
-        while steps < max_steps and stale < self.patience:
-            epoch_nll, epoch_steps = self._train_epoch(train, max_steps - steps)
-            steps, epochs = steps + epoch_steps, epochs + 1
-            nll, error = self._judge(held)
-            if not (nll + error).isfinite().all():
-                # Adam's moments are as broken as the weights
-                self.optimizer.state.clear()
-                warnings.warn(f"loss not finite after {steps} steps; restored the ensemble's best state", stacklevel=2)
-                break
-            train_nll = float(epoch_nll)
-            better = ~(error >= best_error)  # also where the start was not finite
-            best_nll, best_error = th.where(better, nll, best_nll), th.where(better, error, best_error)
-            for parameter, kept in zip(self.networks.parameters(), best_state):
-                kept.copy_(th.where(better.view(-1, 1, 1), parameter.detach(), kept))
-            advanced = ~(error >= (1.0 - IMPROVEMENT) * mark)
-            mark = th.where(advanced, error, mark)
-            stale = 0 if advanced.any() else stale + 1
+        with fast_products(self.device):
+            train, held = self._prepare(data, weights)
+            best_nll, best_error = self._judge(held)
+            mark, best_state = best_error, [p.detach().clone() for p in self.networks.parameters()]
+            steps, epochs, stale, train_nll = 0, 0, 0, math.nan
+            while steps < max_steps and stale < self.patience:
+                epoch_nll, epoch_steps = self._train_epoch(train, max_steps - steps)
+                steps, epochs = steps + epoch_steps, epochs + 1
+                nll, error = self._judge(held)
+                if not (nll + error).isfinite().all():
+                    # Adam's moments are as broken as the weights
+                    self.optimizer.state.clear()
+                    warnings.warn(
+                        f"loss not finite after {steps} steps; restored the ensemble's best state", stacklevel=2
+                    )
+                    break
+                train_nll = float(epoch_nll)
+                better = ~(error >= best_error)  # also where the start was not finite
+                best_nll, best_error = th.where(better, nll, best_nll), th.where(better, error, best_error)
+                for parameter, kept in zip(self.networks.parameters(), best_state):
+                    kept.copy_(th.where(better.view(-1, 1, 1), parameter.detach(), kept))
+                advanced = ~(error >= (1.0 - IMPROVEMENT) * mark)
+                mark = th.where(advanced, error, mark)
+                stale = 0 if advanced.any() else stale + 1
         with th.no_grad():
             for parameter, kept in zip(self.networks.parameters(), best_state):
                 parameter.copy_(kept)
