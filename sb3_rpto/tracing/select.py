@@ -32,8 +32,8 @@ TRIFLE = 0.01
 FOLDS = 6
 #: t from which on an effect seems to matter.
 SEEMS = 1.5
-#: Rounds of the look forward, and candidates fitted in each.
-ROUNDS, PROMISING = 3, 4
+#: Rounds of the look forward, after a joint fit and in its place, and candidates fitted in each.
+ROUNDS, INSTEAD, PROMISING = 3, 8, 4
 #: Pairs of kept effects in whose place one is tried.
 MERGES = 3
 #: Typical window error, in units of the noise, that leaves nothing to look forward to.
@@ -423,12 +423,12 @@ class Selector:
             selection.dropped[worst] = (0, selection.evidence[worst])
             selection.model = self.model([i for i in current.effects if i != worst], current.fit)
 
-    def add_back(self, selection: Selection, candidates: Sequence[int]) -> Selection:
-        """The look forward: where much is missing, the joint fit may end far from the best; add what is clearly needed.
+    def look_forward(self, selection: Selection, candidates: Sequence[int], rounds: int = ROUNDS) -> Selection:
+        """Where much is missing, the joint fit may end far from the best: add what is clearly needed.
 
         Each round fits the effects outside one by one, first roughly, and keeps the best if it is clear.
         """
-        for _ in range(ROUNDS):
+        for _ in range(rounds):
             current = selection.model
             if np.median(current.errors) < ENOUGH:
                 break

@@ -23,7 +23,7 @@ from sb3_rpto.tracing.model_checks import check_against
 from sb3_rpto.tracing.report import Candidate, Report, Traced
 from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary, typical
 from sb3_rpto.tracing.screen import Screening, screen
-from sb3_rpto.tracing.select import SEEMS, Model, Selection, Selector
+from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
 from sb3_rpto.tracing.windows import Windows, cut, discretised, noise_levels
 
 #: Most windows to fit, and to select on.
@@ -203,15 +203,21 @@ def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
 def search(selector: Selector, rough: Selector, base: Model, screening: Screening, say: Progress) -> Selection:
     """Joint fit of all excited candidates, elimination backwards, a last look forward, substitution by like ones.
 
+    Where the joint fit ends far from the noise, effects are added one by one instead.
+
     :param selector: integrates finely, for what is decided in the end
     :param rough: integrates as the model does, for the elimination: it costs most
     :param base: the declared parameters alone
     """
     chosen = worth_fitting(selector, screening)
     say(0.2, f"fitting {len(chosen)} candidates together")
-    # What seems to matter stays while much else may still be wrong.
-    selection = rough.eliminate(Selection(rough.together(chosen, rough.model((), base.fit).fit)), SEEMS)
-    selection = rough.add_back(selection, chosen)
+    alone = rough.model((), base.fit)
+    joint = rough.together(chosen, alone.fit)
+    if rough.far(joint):  # it is stuck, or more lacks than they can give: no place to begin
+        selection = rough.look_forward(Selection(alone), chosen, INSTEAD)
+    else:
+        # What seems to matter stays while much else may still be wrong.
+        selection = rough.look_forward(rough.eliminate(Selection(joint), SEEMS), chosen)
     selection = rough.eliminate(selection)
     say(0.7, "trying like effects in their place")
     selection = rough.merge(rough.substitute(selection, screening), screening)

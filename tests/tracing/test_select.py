@@ -151,7 +151,7 @@ def test_looking_forward_brings_a_wrongly_dropped_effect_back() -> None:
     s, _ = with_friction()
     nothing = Selection(s.model((), s.train.score(s.train.null)))
     nothing.dropped[COULOMB] = (1, None)
-    found = s.add_back(nothing, [COULOMB, OFFSET, DRAG])
+    found = s.look_forward(nothing, [COULOMB, OFFSET, DRAG])
     assert found.model.effects == (COULOMB,)
     assert COULOMB not in found.dropped
 
