@@ -1,0 +1,301 @@
+"""The zoo's experiment manager over two worlds: it trains between a source and a target and judges on the target."""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import optuna
+from rl_zoo3.callbacks import TrialEvalCallback
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import get_callback_list
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_rpto.algorithms.bookkeeping import TARGET_SEED_OFFSET
+from sb3_rpto.algorithms.transfer import TransferAlgorithm
+from sb3_rpto.algorithms.warm import carried_arguments, load_sac
+from sb3_rpto.zoo.samplers import SAMPLERS
+from sb3_rpto.zoo.settings import ALGORITHMS, section, shipped_file, source_of
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a run starts; the target is the zoo's ``--env``.
+
+    :param source_env: id of the source
+    :param source_model: zip of the SAC that was trained there; None: the run trains one first
+    :param source_data: transitions of the source, as ``from_source`` takes them
+    :param source_timesteps: of the training in the source, as ``learn`` takes them
+    """
+
+    source_env: str
+    source_model: str | None = None
+    source_data: str | None = None
+    source_timesteps: int | None = None
+
+
+class TransferManager(ExperimentManager):
+    """Trains RPO, RTO, RPTO and the model-based baselines; other algorithms as the zoo does.
+
+    ``env_kwargs`` are the source's, ``eval_env_kwargs`` the target's (by default the same). ``n_envs`` counts source
+    environments; there is one target. Monitor files, checkpoints, evaluation and Optuna's trials are the target's.
+
+    :param args: as the zoo's, like all that follow
+    :param algo: likewise
+    :param env_id: of the target
+    :param positional: likewise
+    :param start: where a run starts, for an algorithm of ours
+    :param keywords: likewise
+    """
+
+    def __init__(
+        self,
+        args: argparse.Namespace,
+        algo: str,
+        env_id: str,
+        *positional: Any,
+        start: Start | None = None,
+        **keywords: Any,
+    ) -> None:
+        self._shipped = None
+        if not keywords.get("config") and (algo in ALGORITHMS or source_of(env_id)):
+            self._shipped = shipped_file(algo)
+            keywords["config"] = str(self._shipped) if self._shipped else None
+        vars(args).update(vars(start) if start else {})  # args.yml, which the zoo writes beside the agent, holds them
+        super().__init__(args, algo, env_id, *positional, **keywords)
+        self.start = start
+        self.resumes = self.continue_training
+        if start is not None and not self.optimize_hyperparameters:
+            self.continue_training = True  # the zoo then asks _load_pretrained_agent for the model
+        self._n_source_envs = 1
+
+    # ------------------------------------------------------------------ settings
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """As the zoo's; in a file of ours, a target has the settings of its task."""
+        env_name = self.env_name
+        if self._shipped is not None:
+            self.env_name = type(env_name)(section(self.algo, env_name.gym_id))
+        try:
+            return super().read_hyperparameters()
+        finally:
+            self.env_name = env_name
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        """As the zoo's; with two worlds ``n_envs`` is taken to be the source's, callbacks count target steps."""
+        preprocessed = super()._preprocess_hyperparams(hyperparams)
+        if self.start is not None:
+            self._n_source_envs, self.n_envs = self.n_envs, 1
+            if self.frame_stack is not None or self.vec_env_wrapper is not None:
+                raise ValueError(f"--algo {self.algo} takes env_wrapper; leave frame_stack and vec_env_wrapper out")
+        return preprocessed
+
+    def create_callbacks(self) -> None:
+        """As the zoo's, with checkpoints that a run can resume from."""
+        super().create_callbacks()
+        for callback in self.callbacks:
+            if isinstance(callback, CheckpointCallback):
+                callback.save_replay_buffer = self.save_replay_buffer
+                callback.save_vecnormalize = True
+
+    # ------------------------------------------------------------------ worlds
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """The target to evaluate in, or the source to train in; arguments as the zoo's."""
+        if self.start is None or eval_env:
+            return super().create_envs(n_envs, eval_env, no_log)
+        return self._maybe_normalize(self._make(self.start.source_env, self.env_kwargs, self._n_source_envs), False)
+
+    def create_target(self, no_log: bool = False) -> VecEnv:
+        """The target to train in; the algorithm normalises it by the source's statistics.
+
+        :param no_log: leave no monitor file, as in a search
+        """
+        folder = None if no_log else self.save_path
+        target = self._make(self.env_name.gym_id, self.eval_env_kwargs, monitor_dir=folder)
+        target.seed(self.seed + TARGET_SEED_OFFSET)
+        return target
+
+    def _make(self, env_id: str, env_kwargs: dict[str, Any], n_envs: int = 1, monitor_dir: str | None = None) -> VecEnv:
+        kind: Any = self.vec_env_class
+        return make_vec_env(
+            partial(gym.make, env_id, **env_kwargs),
+            n_envs=n_envs,
+            seed=self.seed,
+            monitor_dir=monitor_dir,
+            wrapper_class=self.env_wrapper,
+            vec_env_cls=kind,
+            vec_env_kwargs=self.vec_env_kwargs,
+            monitor_kwargs=self.monitor_kwargs,
+        )
+
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        """As the zoo's; a checkpoint's statistics are those that were saved with it."""
+        statistics = beside(self.trained_agent, "vecnormalize")
+        if statistics is None or not statistics.is_file():
+            return super()._maybe_normalize(env, eval_env)
+        env = VecNormalize.load(str(statistics), env)
+        if eval_env:
+            env.training = env.norm_reward = False
+        return env
+
+    # ------------------------------------------------------------------ models
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        """The model to train: a checkpoint that goes on, or a new one."""
+        if self.start is None:
+            if self.algo == "sac":
+                hyperparams["learning_starts"] = 0  # a trained agent takes no random steps
+            return super()._load_pretrained_agent(hyperparams, env)
+        if not self.resumes:
+            asked = self.custom_hyperparams or {}
+            return self._begin(self.start, hyperparams, asked, env, self.create_target(), seed=self.seed)
+        if self.custom_hyperparams:
+            raise ValueError("--trained-agent goes on with the settings that it was saved with; leave -params out")
+        print(f"Resuming {self.trained_agent}")
+        model = ALGORITHMS[self.algo].load(
+            self.trained_agent,
+            env,
+            target_env=self.create_target(),
+            tensorboard_log=self.tensorboard_log,
+            verbose=self.verbose,
+            device=self.device,
+        )
+        if model.num_timesteps >= self.n_timesteps:
+            raise ValueError(
+                f"--trained-agent has taken {model.num_timesteps} target steps already; pass --n-timesteps above that"
+            )
+        data = beside(self.trained_agent, "replay_buffer")
+        if data is not None and data.is_file():
+            model.load_replay_buffer(data)
+        else:
+            warnings.warn(
+                f"there is no replay buffer beside {self.trained_agent}: the run goes on with empty ones "
+                "(--save-replay-buffer saves them)",
+                stacklevel=2,
+            )
+        return model
+
+    def _begin(
+        self,
+        start: Start,
+        hyperparams: dict[str, Any],
+        asked: Collection[str],
+        source: VecEnv,
+        target: VecEnv,
+        **settings: Any,
+    ) -> TransferAlgorithm:
+        """A new model, from the source agent where one was named.
+
+        :param start: where the run starts
+        :param hyperparams: constructor arguments
+        :param asked: those of them that win over what the source agent brings along
+        :param source: to train in
+        :param target: to train in
+        :param settings: further constructor arguments
+        """
+        common = {"tensorboard_log": self.tensorboard_log, "verbose": self.verbose, "device": self.device}
+        settings = {**hyperparams, **common, **settings, "target_env": target}
+        cls = ALGORITHMS[self.algo]
+        if start.source_model is None:
+            return cls(env=source, **settings)
+        sac = load_sac(start.source_model, self.device)
+        brought = {"policy", *carried_arguments(sac)} - set(asked)
+        settings = {name: value for name, value in settings.items() if name not in brought}
+        return cls.from_source(sac, source, source_data=start.source_data, **settings)
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """As the zoo's; ``n_timesteps`` is the number of target steps at the end, also of a run that was resumed."""
+        if self.start is None or not isinstance(model, TransferAlgorithm):
+            super().learn(model)
+            return
+        log_interval: Any = self.log_interval if self.log_interval >= 0 else None
+        if self.log_interval == -1:  # the zoo's "as the algorithm has it"; below, it logs nothing
+            log_interval = 4
+        try:
+            model.learn(
+                self.n_timesteps - model.num_timesteps,
+                callback=self.callbacks or None,
+                reset_num_timesteps=not self.resumes,
+                source_timesteps=self.start.source_timesteps,
+                log_interval=log_interval,
+            )
+        except KeyboardInterrupt:  # what was learned is saved, and resumes
+            pass
+        finally:
+            if self.callbacks:  # the progress bar is the first
+                self.callbacks[0].on_training_end()
+            _close(model)
+
+    # ------------------------------------------------------------------ search
+
+    def objective(self, trial: optuna.Trial) -> float:
+        """Train with drawn hyperparameters; return the mean return on the target.
+
+        :param trial: as the zoo's
+        :raises optuna.exceptions.TrialPruned: for a trial that is stopped early or whose numbers leave their range
+        """
+        if self.start is None:
+            return super().objective(trial)
+        sampled = SAMPLERS[self.algo](trial, self.n_actions, self._n_source_envs, {})
+        merged = {**self._hyperparams, **sampled}
+        if "dynamics_kwargs" in sampled:
+            merged["dynamics_kwargs"] = {**self._hyperparams.get("dynamics_kwargs", {}), **sampled["dynamics_kwargs"]}
+        source, target = self.create_envs(1, no_log=True), self.create_target(no_log=True)
+        evaluation = self.create_envs(self.n_eval_envs, eval_env=True)
+        folder = None
+        if self.optimization_log_path is not None:
+            folder = str(Path(self.optimization_log_path) / f"trial_{trial.number}")
+        judge = TrialEvalCallback(
+            evaluation,
+            trial,
+            best_model_save_path=folder,
+            log_path=folder,
+            n_eval_episodes=self.n_eval_episodes,
+            eval_freq=max(self.n_timesteps // self.n_evaluations, 1),
+            deterministic=self.deterministic_eval,
+        )
+        asked = {*(self.custom_hyperparams or {}), *sampled}
+        verbose = self.verbose if self.verbose >= 2 else 0
+        model = self._begin(self.start, merged, asked, source, target, seed=None, verbose=verbose)
+        try:
+            model.learn(self.n_timesteps, callback=[*get_callback_list({"callback": self.specified_callbacks}), judge])
+        except ValueError as error:  # numbers that are not finite any more
+            print(f"trial {trial.number} is pruned: {error}")
+            raise optuna.exceptions.TrialPruned() from error
+        finally:
+            _close(model)
+            evaluation.close()
+        if judge.is_pruned:
+            raise optuna.exceptions.TrialPruned()
+        return float(judge.last_mean_reward)
+
+
+def beside(trained_agent: str, kind: str) -> Path | None:
+    """The file of a kind that was saved with a zip, by SB3's and the zoo's names; None without a zip.
+
+    :param trained_agent: the zip
+    :param kind: ``replay_buffer`` or ``vecnormalize``
+    """
+    if not trained_agent:
+        return None
+    path = Path(trained_agent)
+    stem = path.stem
+    if stem.startswith("rl_model_") and stem.endswith("_steps"):
+        return path.with_name(f"rl_model_{kind}_{stem.removeprefix('rl_model_')}.pkl")
+    return path.with_name(f"pretrain_{kind}.pkl" if stem == "pretrain" else f"{kind}.pkl")
+
+
+def _close(model: TransferAlgorithm) -> None:
+    for world in (model.env, model.target_env):
+        if world is not None:
+            world.close()

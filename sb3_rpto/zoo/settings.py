@@ -1,0 +1,66 @@
+"""What the zoo knows of a task by its id: the source of a target, and an algorithm's settings. Needs no rl_zoo3."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import yaml
+
+from sb3_rpto.algorithms import RPO, RPTO, RTO
+from sb3_rpto.algorithms.mbpo import MBPO
+from sb3_rpto.algorithms.pdml import PDML
+from sb3_rpto.algorithms.ptp import PTP
+from sb3_rpto.algorithms.slbo import SLBO
+from sb3_rpto.algorithms.transfer import TransferAlgorithm
+from sb3_rpto.envs import tasks
+
+#: The algorithms that the launcher adds to those of the zoo, by the names of ``--algo``.
+ALGORITHMS: dict[str, type[TransferAlgorithm]] = {
+    **{"rpo": RPO, "rto": RTO, "rpto": RPTO},
+    **{"mbpo": MBPO, "ptp": PTP, "pdml": PDML, "slbo": SLBO},
+}
+_FOLDER = resources.files("sb3_rpto") / "hyperparams" / "zoo"
+
+
+def source_of(target_id: str) -> str | None:
+    """The source of one of our targets; a source is its own, an environment of somebody else has none.
+
+    :param target_id: gymnasium id
+    """
+    spec = gym.registry.get(target_id)
+    if spec is None or not str(spec.entry_point).startswith(f"{tasks.__name__}:"):
+        return None
+    return tasks.env_id(spec.kwargs["task"])
+
+
+def shipped_file(algo: str) -> Path | None:
+    """The YAML file of an algorithm's settings, None where we ship none."""
+    path = Path(str(_FOLDER / f"{algo}.yml"))
+    return path if path.is_file() else None
+
+
+def section(algo: str, env_id: str) -> str:
+    """The key of an algorithm's file that holds for an environment."""
+    return source_of(env_id) or env_id
+
+
+def shipped_settings(algo: str, env_id: str) -> dict[str, Any]:
+    """The shipped settings of an algorithm in an environment, ``n_timesteps`` and ``policy`` among them.
+
+    :param algo: name of a shipped file
+    :param env_id: id of a source or a target; the section ``default`` holds for those that the file does not name
+    :raises ValueError: for an algorithm without a file
+    """
+    path = shipped_file(algo)
+    if path is None:
+        raise ValueError(f"there are no settings for {algo!r}; there are some for {', '.join(shipped_algorithms())}")
+    sections = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return dict(sections.get(section(algo, env_id), sections["default"]))
+
+
+def shipped_algorithms() -> list[str]:
+    """Names of the algorithms that we ship settings for."""
+    return sorted(path.name.removesuffix(".yml") for path in _FOLDER.iterdir() if path.name.endswith(".yml"))

@@ -1,0 +1,275 @@
+"""The RL Zoo with two worlds: settings, training, resuming, searching, and what is said to wrong arguments."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import SMALL_ENSEMBLE, pendulum
+from stable_baselines3 import SAC
+
+from sb3_rpto import RPO, RPTO
+from sb3_rpto.envs import tasks
+from sb3_rpto.experiments.methods import REGISTRY
+from sb3_rpto.presets import preset_names, resolve_preset
+from sb3_rpto.zoo import enjoy, train
+from sb3_rpto.zoo.samplers import SAMPLERS, convert
+from sb3_rpto.zoo.settings import ALGORITHMS, shipped_algorithms, shipped_file, shipped_settings, source_of
+
+SOURCE, TARGET = "rpto/ContinuousCartPole-v0", "rpto/ContinuousCartPole-limb-x2-v0"
+SMALL = ["-params", "gradient_steps:1", "source_steps:2"]
+COLD = [*SMALL, "policy_kwargs:dict(net_arch=[16])", "normalize:True"]
+
+# ---------------------------------------------------------------------- settings: no rl_zoo3 needed
+
+
+def test_every_algorithm_has_settings_for_every_task():
+    assert set(shipped_algorithms()) == {*ALGORITHMS, "sac"}
+    assert set(ALGORITHMS) < set(REGISTRY)
+    for algo in shipped_algorithms():
+        written = shipped_file(algo).read_text()
+        for task in tasks.TASKS:
+            assert f"{tasks.env_id(task)}:" in written
+            settings = shipped_settings(algo, tasks.env_id(task))
+            assert settings["policy"] == "MlpPolicy"
+            assert settings == shipped_settings(algo, tasks.env_id(task, "target0"))
+        assert shipped_settings(algo, "SomebodysRobot-v3")["n_timesteps"] > 0
+
+
+@pytest.mark.parametrize("task", tasks.TASKS)
+def test_a_number_has_one_place(task):
+    """Of what a preset or the authors' numbers set, the zoo's files repeat nothing."""
+    env_id = tasks.env_id(task)
+    budgets = set()
+    for algo, cls in ALGORITHMS.items():
+        settings = shipped_settings(algo, env_id)
+        budgets.add(settings.pop("n_timesteps"))
+        assert settings.pop("policy") == "MlpPolicy"
+        if hasattr(cls, "published"):
+            set_elsewhere = cls.published(env_id)
+            stage = settings.pop("model_train_freq", None)  # SLBO's, in budgets too small for the published one
+            assert stage in (None, max(budgets) // 4)
+        else:
+            preset = settings.pop("preset")
+            assert preset in preset_names()
+            set_elsewhere = resolve_preset(preset, "ensemble" if cls.updates_dynamics else "real", env_id, ())
+        assert not settings.keys() & set_elsewhere.keys()
+        papers = resolve_preset("paper", "ensemble", env_id, ())
+        assert settings == {name: papers[name] for name in settings}  # gamma of the Swimmer
+        assert settings.get("gamma") == papers.get("gamma") == shipped_settings("sac", env_id).get("gamma") or (
+            task == "ContinuousCartPole"
+        )
+    assert len(budgets) == 1  # a comparison has one budget
+
+
+def test_the_presets_are_not_the_zoos_files():
+    assert preset_names() == ["author", "default", "paper"]
+
+
+def test_the_source_of_a_target():
+    assert source_of("rpto/Hopper-gravity-x2-v0") == source_of("rpto/Hopper-v0") == "rpto/Hopper-v0"
+    assert source_of("Hopper-v5") is None
+    assert source_of("Nothing-v7") is None
+
+
+def test_an_algorithm_without_settings_names_the_others():
+    with pytest.raises(ValueError, match="rpto"):
+        shipped_settings("ppo", SOURCE)
+
+
+# ---------------------------------------------------------------------- the search space
+
+
+class Draws:
+    """Stands in for a trial: the first or the last of what may be drawn."""
+
+    def __init__(self, last: bool) -> None:
+        self.last, self.drawn = last, {}
+
+    def suggest_int(self, name, low, high, log=False):
+        return self._keep(name, high if self.last else low)
+
+    suggest_float = suggest_int
+
+    def suggest_categorical(self, name, choices):
+        return self._keep(name, choices[-1 if self.last else 0])
+
+    def _keep(self, name, value):
+        self.drawn[name] = value
+        return value
+
+
+@pytest.mark.parametrize("last", [False, True])
+@pytest.mark.parametrize("algo", SAMPLERS)
+def test_what_is_drawn_are_arguments_of_the_algorithm(algo, last):
+    trial = Draws(last)
+    kwargs = SAMPLERS[algo](trial, 1, 1, {})
+    assert kwargs == convert(trial.drawn)  # what the zoo's --trial-id makes of the study
+    if "dynamics_kwargs" in kwargs:
+        kwargs["dynamics_kwargs"] |= {k: v for k, v in SMALL_ENSEMBLE.items() if k != "max_steps"}
+    model = ALGORITHMS[algo]("MlpPolicy", pendulum(), target_env=pendulum(12.0), device="cpu", **kwargs)
+    for name in kwargs.keys() - {"dynamics_kwargs", "learning_rate"}:
+        assert getattr(model, name) == kwargs[name]
+
+
+# ---------------------------------------------------------------------- with rl_zoo3
+
+
+@pytest.fixture(scope="module")
+def zoo():
+    """rl_zoo3 without what it does to gymnasium: other tests run in this process."""
+    places = [gym.wrappers, gym.wrappers.common]
+    kept = [(place, place.TimeLimit) for place in places]
+    rl_zoo3 = pytest.importorskip("rl_zoo3", reason="the extra 'zoo' is not installed")
+    yield rl_zoo3
+    for place, time_limit in kept:
+        place.TimeLimit = time_limit
+
+
+@pytest.fixture(scope="module")
+def agent(tmp_path_factory) -> Path:
+    """The zip of a SAC of the source, hardly trained."""
+    path = tmp_path_factory.mktemp("source") / "sac.zip"
+    SAC("MlpPolicy", gym.make(SOURCE), gamma=0.97, policy_kwargs={"net_arch": [16]}, device="cpu").save(path)
+    return path
+
+
+def launch(folder: Path, algo: str, *options: str, env: str = TARGET) -> Path:
+    """Train; the folder of the run."""
+    common = ["--seed", "1", "--device", "cpu", "--verbose", "0", "-f", str(folder)]
+    assert train.main(["--algo", algo, "--env", env, *common, *options]) == 0
+    runs = sorted((folder / algo).glob(f"{env.replace('/', '-')}_*"))
+    return runs[-1]
+
+
+def final(run: Path) -> Path:
+    return run / f"{run.name.rpartition('_')[0]}.zip"
+
+
+@pytest.fixture(scope="module")
+def trained(zoo, tmp_path_factory) -> Path:
+    """A run of RPO from scratch, with a checkpoint in its middle."""
+    folder = tmp_path_factory.mktemp("logs")
+    evaluation = ["--eval-freq", "20", "--eval-episodes", "2"]
+    saving = ["--save-freq", "20", "--save-replay-buffer"]
+    return launch(folder, "rpo", "-n", "40", "--source-timesteps", "120", *evaluation, *saving, *COLD)
+
+
+def test_training_is_judged_on_the_target(trained):
+    model = RPO.load(final(trained), device="cpu")
+    assert model.num_timesteps == 40
+    assert model.target_spent == {"learning": 40}
+    assert model.preset == "default"
+    assert model.real_ratio == resolve_preset("default", "real", SOURCE, ())["real_ratio"]
+    assert model._pretrained_steps == 120
+    with np.load(trained / "evaluations.npz") as evaluations:
+        assert evaluations["timesteps"].tolist() == [20, 40]
+    header = (trained / "0.monitor.csv").read_text().splitlines()[0]
+    assert TARGET in header  # the zoo's curves are the target's
+
+
+def test_a_resumed_run_is_the_one_that_was_not_stopped(trained):
+    checkpoint = str(trained / "rl_model_20_steps.zip")
+    resumed = launch(trained.parents[1], "rpo", "-n", "40", "--eval-freq", "-1", "-i", checkpoint)
+    assert resumed != trained
+    one, other = (RPO.load(final(run), device="cpu") for run in (trained, resumed))
+    assert other.num_timesteps == 40
+    theirs = other.policy.state_dict()
+    assert all(th.equal(value, theirs[name]) for name, value in one.policy.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [(["-n", "20"], "--n-timesteps above"), (["-n", "40", "-params", "gradient_steps:2"], "leave -params out")],
+)
+def test_what_cannot_be_resumed_is_said(trained, options, message):
+    with pytest.raises(ValueError, match=message):
+        launch(trained.parents[1], "rpo", "--eval-freq", "-1", "-i", str(trained / "rl_model_20_steps.zip"), *options)
+
+
+def test_enjoy_runs_the_agent(trained, capsys):
+    folder = str(trained.parents[1])
+    options = ["--algo", "rpo", "--env", TARGET, "-f", folder, "--exp-id", "1", "--no-render", "-n", "120"]
+    assert enjoy.main([*options, "--device", "cpu"]) == 0
+    assert "Mean reward" in capsys.readouterr().out
+
+
+def test_a_source_agent_brings_its_settings_along(zoo, agent, tmp_path):
+    source = ["--source-model", str(agent), "-n", "4", "--eval-freq", "-1"]
+    physical = ["dynamics:'physical'", "declared:['pole_length']"]
+    run = launch(tmp_path, "rpto", *source, *SMALL, *physical, "batch_size:16")
+    model = RPTO.load(final(run), device="cpu")
+    assert (model.gamma, model.batch_size, model._pretrained_steps) == (0.97, 16, 0)
+    assert model.policy_kwargs["net_arch"] == [16]
+    saved = (run / final(run).stem / "args.yml").read_text()
+    assert str(agent) in saved
+    assert SOURCE in saved
+
+
+def test_another_factor_is_a_target_too(zoo, agent, tmp_path):
+    source = ["--source-model", str(agent), "-n", "4", "--eval-freq", "2", "--eval-episodes", "1"]
+    run = launch(tmp_path, "rpo", *source, "--eval-env-kwargs", "shift:'limb-x3'", *SMALL, env=SOURCE)
+    assert RPO.load(final(run), device="cpu").num_timesteps == 4
+
+
+def test_sac_that_was_trained_takes_no_random_steps_in_the_target(zoo, agent, tmp_path):
+    run = launch(tmp_path, "sac", "-i", str(agent), "-n", "4", "--eval-freq", "-1")
+    assert SAC.load(final(run), device="cpu").learning_starts == 0
+
+
+def test_a_search_is_judged_on_the_target(zoo, agent, tmp_path, monkeypatch):
+    from sb3_rpto.zoo.manager import TransferManager
+
+    made = []
+    create = TransferManager.create_envs
+
+    def watched(self, n_envs, eval_env=False, no_log=False):
+        envs = create(self, n_envs, eval_env, no_log)
+        made.append((eval_env, envs.get_attr("spec")[0].id))
+        return envs
+
+    monkeypatch.setattr(TransferManager, "create_envs", watched)
+    search = ["-optimize", "--n-trials", "2", "--sampler", "random", "--pruner", "none", "--no-optim-plots"]
+    judged = ["-n", "4", "--n-evaluations", "2", "--eval-episodes", "1"]
+    options = ["--algo", "rpo", "--env", TARGET, "-f", str(tmp_path), "--source-model", str(agent), "--seed", "1"]
+    assert train.main([*options, *search, *judged, "--verbose", "0", "-params", "batch_size:16"]) == 0
+    assert set(made) == {(False, SOURCE), (True, TARGET)}
+    (report,) = (tmp_path / "rpo").glob("report_*.csv")
+    with report.open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["state"] for row in rows] == ["COMPLETE", "COMPLETE"]
+    assert all(float(row["value"]) > 0 and 1 <= int(row["params_gradient_steps"]) <= 40 for row in rows)
+
+
+# ---------------------------------------------------------------------- wrong arguments
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--env", SOURCE], "-target0-v0"),
+        (["--env", "Pendulum-v1"], "--source-env"),
+        (["--env", "rpto/ContinuousCartPole-limb-x3-v0"], "did you mean rpto/ContinuousCartPole-limb-x2-v0"),
+        (["--env", TARGET, "--source-model", "absent.zip"], "there is no file 'absent.zip'"),
+        (["--env", TARGET, "--source-data", "absent.npz"], "there is no file 'absent.npz'"),
+        (["--env", TARGET, "-optimize"], "-optimize needs --source-model"),
+        (["--env", TARGET, "--source-model", __file__, "-i", "some.zip"], "leave one of them out"),
+        (["--env", TARGET, "--algo", "sac", "--source-model", __file__], "--algo sac has one world"),
+    ],
+)
+def test_wrong_arguments_end_before_the_work(zoo, options, message, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        train.main(["--algo", "rpto", *options])
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [train, enjoy])
+def test_without_the_extra_the_remedy_is_named(command, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rl_zoo3", None)
+    assert command.main(["--algo", "rpto"]) == 2
+    assert "pip install 'sb3-rpto[zoo]'" in capsys.readouterr().err
