@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
@@ -15,7 +15,8 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.sac.policies import SACPolicy
 from torch.nn import functional as F
 
-from sb3_rpto.algorithms.forward import descend, follow, fuse, sample_actions, smallest_q
+from sb3_rpto.algorithms.descent import Descent, Follower
+from sb3_rpto.algorithms.forward import sample_actions, smallest_q
 from sb3_rpto.buffers import DualReplayBuffer, World, chronological
 from sb3_rpto.dynamics.base import Dynamics, Transitions
 from sb3_rpto.dynamics.products import fast_products
@@ -25,6 +26,14 @@ from sb3_rpto.dynamics.weights import WeightingName, effective_sample_size, rto_
 ALTERNATION = 5
 #: Updates whose batches are gathered at once.
 BURST = 64
+
+
+class Descents(NamedTuple):
+    """The steps of SAC's optimizers."""
+
+    actor: Descent
+    critic: Descent
+    ent_coef: Descent | None = None
 
 
 class RelativeUpdate(SAC):
@@ -72,26 +81,29 @@ class RelativeUpdate(SAC):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        for optimizer in optimizers:
-            fuse(optimizer)
+        descents = Descents(*(Descent(optimizer) for optimizer in optimizers))
+        follow = Follower(self.critic_target, self.critic, self.tau)
         losses: dict[str, list[th.Tensor]] = {}
         with fast_products(self.device):
             for first in range(0, gradient_steps, BURST):
                 batches = self.sample_batches(min(BURST, gradient_steps - first), batch_size)
                 for step, (critic_batch, actor_batch) in enumerate(batches, first):
-                    for name, loss in self.update_once(critic_batch, actor_batch).items():
+                    for name, loss in self.update_once(critic_batch, actor_batch, descents).items():
                         losses.setdefault(name, []).append(loss.detach().reshape(()))
                     if step % self.target_update_interval == 0:
-                        follow(self.critic_target.parameters(), self.critic.parameters(), self.tau)
+                        follow()
                         polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in losses.items():  # read here at once: reading each would wait for the device every step
             self.logger.record(f"train/{name}", float(np.mean(th.stack(values).tolist())))
 
-    def update_once(self, critic_batch: ReplayBufferSamples, actor_batch: ReplayBufferSamples) -> dict[str, th.Tensor]:
+    def update_once(
+        self, critic_batch: ReplayBufferSamples, actor_batch: ReplayBufferSamples, descend: Descents
+    ) -> dict[str, th.Tensor]:
         """One update of temperature, critic and actor, in SAC's order: the actor's loss uses the updated critic.
 
+        :param descend: the optimizers' steps
         :return: the losses, to log
         """
         ent_coef = self.temperature()
@@ -101,14 +113,14 @@ class RelativeUpdate(SAC):
             if self.use_sde:
                 self.actor.reset_noise()
             actions_pi, log_prob = sample_actions(self.actor, actor_batch.observations)
-            if self.ent_coef_optimizer is not None:
+            if descend.ent_coef is not None:
                 losses["ent_coef_loss"] = self.temperature_loss(log_prob)
-                descend(self.ent_coef_optimizer, losses["ent_coef_loss"])
+                descend.ent_coef(losses["ent_coef_loss"])
         losses["critic_loss"] = self.critic_loss(critic_batch, ent_coef)
-        descend(self.critic.optimizer, losses["critic_loss"])
+        descend.critic(losses["critic_loss"])
         if policy_learns:
             losses["actor_loss"] = self.actor_loss(actor_batch, actions_pi, log_prob, ent_coef)
-            descend(self.actor.optimizer, losses["actor_loss"])
+            descend.actor(losses["actor_loss"])
         return losses
 
     def fit_dynamics(self) -> None:
@@ -154,9 +166,7 @@ class RelativeUpdate(SAC):
     def _close_the_loop(self) -> None:
         """After a fit: trace what the simulator lacks, where that was asked for and is due."""
 
-    def sample_batches(
-        self, count: int, batch_size: int
-    ) -> Iterator[tuple[ReplayBufferSamples, ReplayBufferSamples]]:
+    def sample_batches(self, count: int, batch_size: int) -> Iterator[tuple[ReplayBufferSamples, ReplayBufferSamples]]:
         """For each of ``count`` updates a batch for the critic, mostly of D_source, and one for the actor.
 
         The actor sees four batches of D_target, then one of D_source; D_source alone as long as D_target could not
