@@ -305,9 +305,9 @@ class Selector:
                 self.say(f"{self.simulation.effects[e].label} or {self.simulation.effects[other].label}")
                 begin = self._translated(current, best, other)
                 trial = self.model([i for i in current.effects if i != best] + [other], begin, REFIT + 3)
-                if self.evidence(trial, current).clear(SEEMS):
+                if self._better(trial, current):
                     current, alike, best = trial, [], other
-                elif not self.evidence(current, trial).clear(SEEMS):
+                elif not self._better(current, trial):
                     alike.append(other)
                     if self._simpler(other, best):
                         current, best = trial, other
@@ -355,7 +355,7 @@ class Selector:
                 self.say(f"{self.simulation.effects[other].label} is simpler")
                 begin = self._translated(model, e, other)
                 trial = self.model([i for i in model.effects if i != e] + [other], begin, REFIT + 3)
-                if not self.evidence(model, trial).clear(SEEMS):
+                if not self._better(model, trial):
                     model = trial
                     selection.alike[other] = sorted({*selection.alike.pop(e, []), e} - {other})
                     break
@@ -402,6 +402,10 @@ class Selector:
             inner, normal[k:, :k] @ z
         )
         return replace(model.fit, values=np.clip(values, self.train.lower, self.train.upper))
+
+    def _better(self, a: Model, b: Model) -> bool:
+        """Whether one of two likes does better: near the noise that seems so soon, far from it it must be clear."""
+        return self.evidence(a, b).clear(*(self.limit(a) if self.far(a) else (SEEMS,)))
 
     def _simpler(self, a: int, b: int) -> bool:
         return len(self.simulation.effects[a].parameters) < len(self.simulation.effects[b].parameters)
