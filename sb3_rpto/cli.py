@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from sb3_rpto.commands import enjoy, plot, train, transfer
 from sb3_rpto.version import __version__
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _Parser(prog="sb3-rpto", description="Move policies from a simulator to a target, and say what it lacks.")
     parser.add_argument("--version", action="version", version=f"sb3-rpto {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_add_trace, _add_benchmark):
+    for add in (train.add, transfer.add, enjoy.add, plot.add, _add_trace, _add_benchmark):
         add(commands)
     try:
         parsed = parser.parse_args(arguments)

@@ -1,0 +1,156 @@
+"""``sb3-rpto enjoy``: what a policy earns, and how it looks beside the one that it came from."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_rpto.commands import options
+
+if TYPE_CHECKING:
+    from sb3_rpto.commands.policies import Policy
+
+DESCRIPTION = """\
+Run a policy and print its returns. With --video, draw the source policy in the source,
+the source policy in the target (zero-shot) and the policy in the target side by side.
+
+MODEL is a zip, or the folder of 'sb3-rpto transfer' or 'train', which knows the
+environments and the source agent.
+"""
+
+EXAMPLE = """\
+examples:
+  sb3-rpto enjoy runs/hopper-rpto --video hopper.mp4
+  sb3-rpto enjoy model.zip rpto/Hopper-target0-v0 --source-model source.zip --video hopper.gif
+"""
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser's."""
+    parser = commands.add_parser(
+        "enjoy",
+        help="run a policy; film it beside the source policy",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("model", metavar="MODEL", type=Path, help="zip of a model, or a run's folder")
+    parser.add_argument("target", metavar="TARGET", nargs="?", help="id of the world to run in (default: the run's)")
+    parser.add_argument("--episodes", metavar="N", type=int, default=10, help="(default: 10)")
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the initial states (default: 0)")
+    parser.add_argument("--stochastic", action="store_true", help="draw actions as in training")
+    parser.add_argument("--video", metavar="FILE", type=Path, help="write a film: .mp4 or .gif")
+    parser.add_argument("--seconds", metavar="S", type=float, default=10.0, help="of the film at most (default: 10)")
+    parser.add_argument("--source-model", metavar="ZIP", help="agent of the source, for the film (default: the run's)")
+    parser.add_argument("--source", metavar="ID", help="id of the source, for the film (default: likewise)")
+    parser.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace) -> int:
+    """Evaluate, then film."""
+    import gymnasium as gym
+    import numpy as np
+
+    from sb3_rpto.commands.policies import load_policy
+
+    options.check_positive(parsed, "episodes")
+    if not parsed.seconds > 0:
+        raise ValueError(f"--seconds is {parsed.seconds:g}; give a time above 0")
+    model, known = _model(parsed.model)
+    target = parsed.target or known.get("target")
+    if target is None:
+        raise ValueError(f"MODEL {str(parsed.model)!r} is a zip: pass TARGET, the id of the world to run it in")
+    target = options.environment(target, "TARGET")
+    policy = load_policy(model, "MODEL")
+    _check_spaces(policy, target, "MODEL", "TARGET")
+    shown = _shown(parsed, known, target) if parsed.video is not None else None
+
+    env = gym.make(target)
+    returns = []
+    for episode in range(parsed.episodes):
+        returns.append(_episode(env, policy, parsed.seed if episode == 0 else None, not parsed.stochastic))
+        print(f"episode {episode + 1}: return {returns[-1]:.1f}", flush=True)
+    env.close()
+    print(f"mean return {np.mean(returns):.1f}, standard deviation {np.std(returns):.1f}, {len(returns)} episodes")
+    if shown is not None:
+        _film(parsed, policy, target, *shown)
+    return 0
+
+
+def _model(path: Path) -> tuple[Path, dict[str, Any]]:
+    """The zip, and what is known of its run: target, source, source_model."""
+    if not path.is_dir():
+        options.check_file(path, "MODEL")
+        return path, {}
+    options.check_file(path / "model.zip", "MODEL")
+    config = path / "config.json"
+    known = json.loads(config.read_text(encoding="utf-8")) if config.is_file() else {}
+    return path / "model.zip", {name: value for name, value in known.items() if value is not None}
+
+
+def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: str) -> tuple[Policy, str]:
+    """The source policy and the source of a film; all that can fail does so here, before anything is run."""
+    from sb3_rpto.commands import video
+    from sb3_rpto.commands.policies import load_policy
+    from sb3_rpto.zoo.settings import source_of
+
+    video.require(parsed.video)
+    if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+        os.environ.setdefault("MUJOCO_GL", "egl")  # of what draws without a display, what works
+    agent = parsed.source_model or known.get("source_model")
+    if agent is None:
+        raise ValueError("--video compares with the source policy: pass its zip by --source-model")
+    source = parsed.source or known.get("source") or source_of(target.rpartition(":")[2])
+    if source is None:
+        raise ValueError(f"TARGET {target!r} is none of our targets, so its source is not known: pass --source ID")
+    options.check_file(agent, "--source-model")
+    source = options.environment(source, "--source")
+    policy = load_policy(agent, "--source-model")
+    _check_spaces(policy, source, "--source-model", "--source")
+    return policy, source
+
+
+def _check_spaces(policy: Policy, env_id: str, argument: str, world: str) -> None:
+    """Refuse a policy of another task.
+
+    :raises ValueError: naming the argument
+    """
+    import gymnasium as gym
+
+    env = gym.make(env_id)
+    for name in ("observation_space", "action_space"):
+        of_policy, of_env = getattr(policy, name), getattr(env, name)
+        if of_policy.shape != of_env.shape:
+            raise ValueError(f"{argument} has {name} {of_policy}, {world} {env_id!r} has {of_env}; name the same task")
+    env.close()
+
+
+def _episode(env: Any, policy: Policy, seed: int | None, deterministic: bool) -> float:
+    observation, _ = env.reset(seed=seed)
+    total, over = 0.0, False
+    while not over:
+        action, _ = policy.predict(observation, deterministic=deterministic)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        total += float(reward)
+        over = terminated or truncated
+    return total
+
+
+def _film(parsed: argparse.Namespace, policy: Policy, target: str, source_policy: Policy, source: str) -> None:
+    import gymnasium as gym
+
+    from sb3_rpto.commands.video import Panel, film
+
+    in_source, in_target = (partial(gym.make, name, render_mode="rgb_array") for name in (source, target))
+    panels = [
+        Panel("source policy in the source", source_policy, in_source),
+        Panel("source policy in the target (zero-shot)", source_policy, in_target),
+        Panel("transferred policy in the target", policy, in_target),
+    ]
+    film(panels, parsed.video, parsed.seconds, parsed.seed)
+    print(f"written: {parsed.video}")

@@ -1,0 +1,116 @@
+"""``sb3-rpto plot``: learning curves of result files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SUFFIXES = (".png", ".pdf", ".svg")
+
+DESCRIPTION = """\
+Draw learning curves of result files: one panel a target, one line a method, the
+interquartile mean over seeds with its 95 % bootstrap interval.
+"""
+
+EXAMPLE = """\
+example:
+  sb3-rpto plot runs/hopper-* --out hopper.png
+"""
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser's."""
+    parser = commands.add_parser(
+        "plot",
+        help="draw learning curves of result files",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("results", metavar="RESULT", nargs="+", type=Path, help="result files, or folders with some")
+    parser.add_argument("--out", metavar="FIGURE", required=True, type=Path, help=f"one of {', '.join(SUFFIXES)}")
+    parser.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace) -> int:
+    """Read, summarise, draw."""
+    if parsed.out.suffix not in SUFFIXES:
+        raise ValueError(f"--out {parsed.out}: a figure is {', '.join(SUFFIXES)}")
+    try:
+        import pandas as pd
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError(f"plot needs matplotlib and pandas ({error}): pip install 'sb3-rpto[experiments]'") from error
+    from sb3_rpto.algorithms.checkpoint import write_atomically
+
+    rows = pd.DataFrame(read_rows(parsed.results))
+    panels = sorted(rows["target"].unique())
+    figure = Figure(figsize=(5.0 * len(panels), 3.8), layout="constrained")
+    for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels):
+        draw(axes, rows[rows["target"] == panel], panel)
+    form = parsed.out.suffix.removeprefix(".")
+    write_atomically(parsed.out, lambda file: figure.savefig(file, dpi=150), suffix=form)
+    print(f"{len(rows):,} evaluations of {len(panels)} target(s); written: {parsed.out}")
+    return 0
+
+
+def read_rows(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """The rows of all result files, with their target.
+
+    :param paths: result files, or folders that are searched for some
+    :raises ValueError: for a file that is no result, and for folders without any
+    """
+    rows: list[dict[str, Any]] = []
+    for path in paths:
+        if not path.exists():
+            raise FileNotFoundError(f"RESULT: there is nothing at {str(path)!r}; check the path")
+        files = sorted(path.rglob("*.json")) if path.is_dir() else [path]
+        for file in files:
+            found = _result(file)
+            if found is None and not path.is_dir():
+                raise ValueError(f"RESULT {file} is no result file: it has no rows with method, seed, steps and return")
+            rows += found or []
+    if not rows:
+        raise ValueError(f"RESULT: there are no result files in {', '.join(map(str, paths))}")
+    return rows
+
+
+def _result(file: Path) -> list[dict[str, Any]] | None:
+    """The rows of a file; None for one that is something else."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        config = content.get("config", {})
+        target = config.get("target", "")
+        rows = content["rows"]
+        return [{"target": target, **{key: row[key] for key in ("method", "seed", "steps", "return")}} for row in rows]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def draw(axes: Any, rows: pd.DataFrame, title: str) -> None:
+    """One panel.
+
+    :param axes: of matplotlib
+    :param rows: columns method, seed, steps, return
+    :param title: of the panel
+    """
+    from sb3_rpto.experiments.report import summarise
+
+    for method, lines in summarise(rows, ["method", "steps"]).groupby("method", sort=True):
+        seeds = lines["seeds"].max()
+        label = f"{method} ({seeds})"
+        if len(lines) == 1:  # zero-shot
+            axes.axhline(lines["iqm"].iloc[0], color="grey", linestyle="--", label=label)
+            continue
+        (line,) = axes.plot(lines["steps"], lines["iqm"], marker=".", label=label)
+        if seeds > 1:
+            axes.fill_between(lines["steps"], lines["low"], lines["high"], color=line.get_color(), alpha=0.2, lw=0)
+    axes.set(title=title, xlabel="steps", ylabel="return")
+    axes.grid(alpha=0.3)
+    axes.legend(title="method (seeds)", fontsize="small")

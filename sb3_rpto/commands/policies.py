@@ -1,0 +1,54 @@
+"""The policy of any zip of ours or SB3's, whichever algorithm saved it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.save_util import load_from_zip_file
+
+from sb3_rpto.algorithms.slbo import SLBO
+
+
+class Policy(Protocol):
+    """What acts: a policy or an algorithm of SB3."""
+
+    @property
+    def observation_space(self) -> spaces.Space:
+        """What it sees."""
+        ...
+
+    @property
+    def action_space(self) -> spaces.Space:
+        """What it does."""
+        ...
+
+    def predict(self, observation: Any, *, deterministic: bool = False) -> tuple[np.ndarray, Any]:
+        """The action for an observation."""
+        ...
+
+
+def load_policy(path: str | Path, argument: str) -> Policy:
+    """Build the policy alone: no environment, buffers or model of the source are needed.
+
+    :param path: of the zip
+    :param argument: what the user passed it as
+    :raises ValueError: for a file that is no model of SB3's
+    """
+    constant = {"lr_schedule": lambda _: 0.0, "learning_rate": 0.0}
+    try:
+        data, parameters, _ = load_from_zip_file(path, device="cpu", custom_objects=constant)
+    except (ValueError, KeyError) as error:
+        raise ValueError(f"{argument} {str(path)!r} is no zip of a model: {error}") from error
+    if not data or "policy_class" not in data:
+        raise ValueError(f"{argument} {str(path)!r} is no zip of a model of Stable-Baselines3")
+    if "trpo.policy" in parameters:  # SLBO acts by TRPO's policy, beside which it keeps SAC's
+        return SLBO.load(path, device="cpu")
+    policy = data["policy_class"](
+        data["observation_space"], data["action_space"], lambda _: 0.0, **data.get("policy_kwargs", {})
+    )
+    policy.load_state_dict(parameters["policy"])
+    policy.set_training_mode(False)
+    return policy

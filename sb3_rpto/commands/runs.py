@@ -1,0 +1,235 @@
+"""A run's folder: what was asked, the newest checkpoint, the result. A killed run goes on where it was left."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_rpto.algorithms.checkpoint import write_atomically
+from sb3_rpto.algorithms.transfer import TransferAlgorithm
+from sb3_rpto.experiments.run import LearningCurve, MakeEnv
+
+PACKAGES = ("sb3-rpto", "stable-baselines3", "gymnasium", "torch", "numpy")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Everything of one run. ``result.json`` is written last, so it is there when the run is finished.
+
+    :param path: the folder
+    """
+
+    path: Path
+
+    @property
+    def model(self) -> Path:
+        """Zip of the model at the end."""
+        return self.path / "model.zip"
+
+    @property
+    def replay_buffer(self) -> Path:
+        """What it has learned from."""
+        return self.path / "replay_buffer.pkl"
+
+    @property
+    def result(self) -> Path:
+        """Configuration and learning curve."""
+        return self.path / "result.json"
+
+    @classmethod
+    def open(cls, path: Path, config: dict[str, Any]) -> RunFolder:
+        """Begin a run, or go on with it.
+
+        :param path: of the folder; it is made where it is not there
+        :param config: all that decides the outcome, as JSON has it
+        :raises ValueError: when the folder holds a run of another configuration
+        """
+        run, asked = cls(path), json.loads(json.dumps(config))
+        path.mkdir(parents=True, exist_ok=True)
+        file = path / "config.json"
+        if not file.exists():
+            run._write_json(file, asked)
+            return run
+        kept = json.loads(file.read_text(encoding="utf-8"))
+        changed = sorted(name for name in {*kept, *asked} if kept.get(name) != asked.get(name))
+        if changed:
+            name = changed[0]
+            raise ValueError(
+                f"--out {path} holds a run with {name}={kept.get(name)!r}, not {asked.get(name)!r}; choose another "
+                "folder, or repeat the command that began it to go on"
+            )
+        return run
+
+    def finish(self, rows: list[dict[str, Any]]) -> None:
+        """Write the result and forget the checkpoints.
+
+        :param rows: the learning curve
+        """
+        config = json.loads((self.path / "config.json").read_text(encoding="utf-8"))
+        versions = {package: version(package) for package in PACKAGES}
+        self._write_json(self.result, {"config": config, "versions": versions, "rows": rows})
+        shutil.rmtree(self.path / "checkpoints", ignore_errors=True)
+
+    def save_checkpoint(self, steps: int, write: Callable[[Path], None]) -> None:
+        """Replace the checkpoint by a new one, as a whole: its folder gets its name when all files are in it.
+
+        :param steps: taken so far
+        :param write: writes its files into the folder that it is given
+        """
+        folder = self.path / "checkpoints"
+        unfinished = folder / f".{steps:010d}.{os.getpid()}"
+        unfinished.mkdir(parents=True)
+        write(unfinished)
+        unfinished.rename(folder / f"{steps:010d}")
+        for old in folder.iterdir():
+            if old.name != f"{steps:010d}":
+                shutil.rmtree(old)
+
+    def newest_checkpoint(self) -> Path | None:
+        """The folder of the last whole checkpoint."""
+        found = sorted(path for path in (self.path / "checkpoints").glob("[0-9]*"))
+        return found[-1] if found else None
+
+    @staticmethod
+    def _write_json(path: Path, content: Any) -> None:
+        text = json.dumps(content, indent=1)
+        write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"), suffix="json")
+
+
+class SavedCurve(LearningCurve):
+    """A learning curve that tells its rows as they come and leaves a checkpoint after each.
+
+    A checkpoint of ours is written at the step itself and resumes bit for bit. Of SB3's own algorithms it is written
+    when the update that follows is over, before the next rollout.
+
+    :param run: whose checkpoints
+    :param make_env: makes an evaluation environment
+    :param every: steps between evaluations
+    :param total: steps of the run; after the last there is no checkpoint
+    :param n_episodes: of an evaluation
+    :param seed: of the evaluation's initial states
+    :param after_update: as that of :class:`~sb3_rpto.experiments.run.LearningCurve`
+    :param until: return at which the run ends early
+    :param resumable: whether to leave checkpoints
+    :param say: told of each row in a line
+    """
+
+    def __init__(
+        self,
+        run: RunFolder,
+        make_env: MakeEnv,
+        every: int,
+        total: int,
+        n_episodes: int,
+        seed: int,
+        *,
+        after_update: bool = False,
+        until: float | None = None,
+        resumable: bool = True,
+        say: Callable[[str], None] | None = None,
+    ) -> None:
+        super().__init__(make_env, every, n_episodes, seed, after_update=after_update)
+        self.run, self.total, self.until, self.resumable, self.say = run, total, until, resumable, say
+        #: the model that the newest row is of
+        self.judged: Any = None
+        self._unsaved = self._resumed = False
+
+    def evaluate(self, model: Any, steps: int) -> None:
+        """Add a row, and tell of it."""
+        super().evaluate(model, steps)
+        self.judged = model
+        self._unsaved = self.resumable and 0 < steps < self.total
+        if self.say is not None:
+            row = self.rows[-1]
+            left = (
+                f", about {_duration(row['seconds'] * (self.total / steps - 1))} left" if 0 < steps < self.total else ""
+            )
+            self.say(f"{steps:>9,} of {self.total:,} steps: return {row['return']:.1f}{left}")
+
+    def restore(self, folder: Path) -> None:
+        """Go on with the rows of a checkpoint.
+
+        :param folder: of the checkpoint
+        """
+        state = json.loads((folder / "curve.json").read_text(encoding="utf-8"))
+        self.rows, self.source_steps, self._due = state["rows"], state["source_steps"], state["due"]
+        self._spent, self._updates_at_start = state["spent"], state["updates_at_start"]
+        self._resumed = True
+        if self.say is not None:
+            self.say(f"going on from {folder}")
+
+    def _on_training_start(self) -> None:
+        if self._resumed:
+            self._since = time.perf_counter()
+        else:
+            super()._on_training_start()
+
+    def _on_rollout_start(self) -> None:
+        super()._on_rollout_start()
+        if not isinstance(self.model, TransferAlgorithm):
+            self._save()
+
+    def _on_step(self) -> bool:
+        super()._on_step()
+        if isinstance(self.model, TransferAlgorithm):
+            self._save()
+        return self.until is None or self.rows[-1]["return"] < self.until
+
+    def _save(self) -> None:
+        if not self._unsaved:
+            return
+        self._unsaved = False
+        state = {
+            "class": f"{type(self.model).__module__}:{type(self.model).__qualname__}",
+            "rows": self.rows,
+            "source_steps": self.source_steps,
+            "due": self._due,
+            "spent": self._spent + time.perf_counter() - self._since,
+            "updates_at_start": self._updates_at_start,
+        }
+
+        def write(folder: Path) -> None:
+            self.model.save(folder / "model.zip")
+            if getattr(self.model, "replay_buffer", None) is not None:
+                self.model.save_replay_buffer(folder / "replay_buffer.pkl")  # type: ignore[attr-defined]
+            (folder / "curve.json").write_text(json.dumps(state), encoding="utf-8")
+
+        self.run.save_checkpoint(self.num_timesteps, write)
+
+
+def algorithm_of(folder: Path) -> type[BaseAlgorithm]:
+    """The class of a checkpoint's model.
+
+    :param folder: of the checkpoint
+    """
+    state = json.loads((folder / "curve.json").read_text(encoding="utf-8"))
+    module, _, name = state["class"].partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def load_checkpoint(folder: Path, env: Any, device: str = "cpu", **worlds: Any) -> BaseAlgorithm:
+    """The model of a checkpoint, with its replay buffers.
+
+    :param folder: of the checkpoint
+    :param env: SB3's environment
+    :param device: to learn on
+    :param worlds: ``target_env``, for an algorithm of ours
+    """
+    model = algorithm_of(folder).load(folder / "model.zip", env, device=device, **worlds)
+    if (folder / "replay_buffer.pkl").is_file():
+        model.load_replay_buffer(folder / "replay_buffer.pkl")  # type: ignore[attr-defined]
+    return model
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

@@ -1,0 +1,85 @@
+"""``sb3-rpto train``: a SAC of a task, the source policy of later transfers."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from typing import Any
+
+from sb3_rpto.commands import options
+
+DESCRIPTION = """\
+Train a SAC in a task: the source agent of later transfers.
+
+Settings are those of hyperparams/zoo/sac.yml, then SAC's defaults. The same command
+goes on where it was killed: from its last evaluation.
+"""
+
+EXAMPLE = """\
+example:
+  sb3-rpto train Hopper --out runs/hopper-source
+
+writes into DIR model.zip, replay_buffer.pkl (which transfers take as --source-data)
+and result.json (configuration and learning curve).
+"""
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser's."""
+    parser = commands.add_parser(
+        "train",
+        help="train a source agent",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("task", metavar="TASK", help="Hopper, rpto/Hopper-v0, Pendulum-v1, package:name/Task-v0")
+    options.add_common(parser)
+    parser.add_argument("--until", metavar="RETURN", type=float, help="end early, at an evaluation that reaches this")
+    parser.add_argument("--device", default="auto", help="cpu, cuda or auto (default)")
+    parser.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace) -> int:
+    """Train, or go on with it."""
+    import gymnasium as gym
+    from stable_baselines3 import SAC
+
+    from sb3_rpto.algorithms.checkpoint import write_atomically
+    from sb3_rpto.commands.runs import RunFolder, SavedCurve, load_checkpoint
+    from sb3_rpto.zoo.settings import shipped_settings
+
+    options.check_positive(parsed, "steps", "every", "episodes")
+    env_id = options.environment(parsed.task, "TASK")
+    settings = {**shipped_settings("sac", env_id), **dict(parsed.set)}
+    steps = int(settings.pop("n_timesteps") if parsed.steps is None else parsed.steps)
+    settings.pop("n_timesteps", None)
+    options.check_names(settings, SAC.__init__)
+    every = parsed.every or max(steps // 10, 1)
+    config = {
+        **{"command": "train", "method": "sac", "source": None, "target": env_id, "steps": steps, "seed": parsed.seed},
+        **{"every": every, "episodes": parsed.episodes, "until": parsed.until, "settings": settings},
+    }
+    folder = RunFolder.open(parsed.out, config)
+    if folder.result.exists():
+        print(f"trained already: {folder.model}")
+        return 0
+    make = partial(gym.make, env_id)
+    say = None if parsed.quiet else partial(print, flush=True)
+    curve = SavedCurve(folder, make, every, steps, parsed.episodes, parsed.seed, until=parsed.until, say=say)
+    checkpoint = folder.newest_checkpoint()
+    model: Any
+    if checkpoint is None:
+        model = SAC(env=make(), seed=parsed.seed, device=parsed.device, **settings)
+    else:
+        model = load_checkpoint(checkpoint, make(), device=parsed.device)
+        curve.restore(checkpoint)
+    model.learn(steps - model.num_timesteps, callback=curve, reset_num_timesteps=checkpoint is None)
+    curve.env.close()
+    write_atomically(folder.replay_buffer, model.save_replay_buffer, suffix="pkl")
+    write_atomically(folder.model, model.save)
+    rows = [{"method": "sac", "seed": parsed.seed, **row} for row in curve.rows]
+    folder.finish(rows)
+    last = rows[-1]
+    print(f"return {last['return']:.1f} after {last['steps']:,} steps; written: {folder.model}")
+    return 0

@@ -1,0 +1,185 @@
+"""``sb3-rpto transfer``: a source agent to a target, by any method."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_rpto.commands import options
+
+if TYPE_CHECKING:
+    from sb3_rpto.commands.runs import SavedCurve
+    from sb3_rpto.experiments.methods import Run
+
+DESCRIPTION = """\
+Move a source agent to a target, and draw its learning curve there.
+
+The source world is that of the target's task; for an environment of your own name it
+by --source. Settings are the method's own (docs/baselines.md, the presets). The same
+command goes on where it was killed: from its last evaluation.
+"""
+
+EXAMPLE = """\
+example:
+  sb3-rpto transfer runs/hopper-source/model.zip rpto/Hopper-target0-v0 --method rpto \\
+    --source-data runs/hopper-source/replay_buffer.pkl --out runs/hopper-rpto
+
+writes into DIR model.zip and result.json (configuration and learning curve).
+"""
+
+#: Methods that load SAC's zip with settings, which SB3 does not check; what they take beside SAC's arguments.
+LOADING = {
+    **dict.fromkeys(("zero-shot", "sac-warm", "sac-mixed", "oracle"), ()),
+    "sac-warm-high": ("n_critics",),
+    "sysid-retrain": ("declared", "retrain_steps", "max_steps", "dynamics_kwargs"),
+}
+#: Methods that begin anew: nothing is learned step by step, or in two parts.
+NOT_RESUMABLE = ("zero-shot", "sysid-retrain")
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser's."""
+    parser = commands.add_parser(
+        "transfer",
+        help="move a source agent to a target, by any method",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("source_model", metavar="ZIP", help="SAC that was trained in the source")
+    parser.add_argument("target", metavar="TARGET", help="id of the target: rpto/Hopper-target0-v0")
+    parser.add_argument(
+        "--method", default="rpto", help="rpto (default), rpo, rto, sac-warm, mbpo, …: docs/baselines.md"
+    )
+    parser.add_argument("--source", metavar="ID", help="id of the source (default: that of the target's task)")
+    parser.add_argument(
+        "--source-data",
+        metavar="FILE",
+        help="source transitions: replay_buffer.pkl or .npz (default: fresh ones)",
+    )
+    options.add_common(parser, of_target="target ")
+    parser.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace) -> int:
+    """Transfer, or go on with it."""
+    import gymnasium as gym
+
+    from sb3_rpto.algorithms.checkpoint import write_atomically
+    from sb3_rpto.commands.runs import RunFolder, SavedCurve
+    from sb3_rpto.experiments.methods import REGISTRY, Run
+    from sb3_rpto.zoo.settings import ALGORITHMS, shipped_settings
+
+    options.check_positive(parsed, "steps", "every", "episodes")
+    if parsed.method not in REGISTRY:
+        raise ValueError(f"--method {parsed.method!r} does not exist; choose one of {', '.join(REGISTRY)}")
+    options.check_file(parsed.source_model, "ZIP")
+    options.check_file(parsed.source_data, "--source-data")
+    target = options.environment(parsed.target, "TARGET")
+    source = _source(parsed, target)
+    settings = dict(parsed.set)
+    _check(parsed.method, settings, parsed.source_model, target)
+    budget = shipped_settings(parsed.method if parsed.method in ALGORITHMS else "rpto", target)["n_timesteps"]
+    steps = parsed.steps or budget
+    every = parsed.every or max(steps // 10, 1)
+    config = {
+        **{"command": "transfer", "method": parsed.method, "source": source, "target": target, "steps": steps},
+        **{"seed": parsed.seed, "source_model": str(parsed.source_model), "source_data": parsed.source_data},
+        **{"every": every, "episodes": parsed.episodes, "settings": settings},
+    }
+    folder = RunFolder.open(parsed.out, config)
+    if folder.result.exists():
+        print(f"transferred already: {folder.model}")
+        return 0
+    method = REGISTRY[parsed.method]
+    given = Run(
+        parsed.source_model,
+        partial(gym.make, source),
+        partial(gym.make, target),
+        steps,
+        parsed.seed,
+        source_data=parsed.source_data,
+        kwargs=settings,
+    )
+    curve = SavedCurve(
+        folder,
+        given.make_target,
+        every,
+        steps,
+        parsed.episodes,
+        parsed.seed,
+        after_update=method.in_batches,
+        resumable=parsed.method not in NOT_RESUMABLE,
+        say=None if parsed.quiet else partial(print, flush=True),
+    )
+    checkpoint = folder.newest_checkpoint()
+    if checkpoint is None:
+        method.run(given, curve)
+    else:
+        _go_on(checkpoint, given, curve)
+    curve.env.close()
+    write_atomically(folder.model, curve.judged.save)
+    rows = [{"method": parsed.method, "seed": parsed.seed, **row} for row in curve.rows]
+    folder.finish(rows)
+    first, last = rows[0], rows[-1]
+    print(f"return {first['return']:.1f} before, {last['return']:.1f} after {last['steps']:,} target steps; ", end="")
+    print(f"written: {folder.model}")
+    return 0
+
+
+def _source(parsed: argparse.Namespace, target: str) -> str:
+    """The id of the source.
+
+    :raises ValueError: where it is not known, or is the target
+    """
+    from sb3_rpto.zoo.settings import source_of
+
+    source = parsed.source or source_of(target.rpartition(":")[2])
+    if source is None:
+        raise ValueError(f"TARGET {target!r} is none of our targets, so its source is not known: pass --source ID")
+    source = options.environment(source, "--source")
+    if source == target:
+        raise ValueError(f"TARGET {target!r} is the source itself; name another world (docs/tasks.md)")
+    return source
+
+
+def _check(method: str, settings: dict[str, Any], source_model: str, target: str) -> None:
+    """Refuse what would fail later: a zip of another task, settings that the method does not know.
+
+    :raises ValueError: naming the argument
+    """
+    import gymnasium as gym
+    from stable_baselines3 import SAC
+
+    from sb3_rpto.algorithms.warm import load_sac
+
+    if method in LOADING:
+        options.check_names(settings, SAC.__init__, LOADING[method])
+    if method == "sysid-retrain" and not settings.get("declared"):
+        raise ValueError("--method sysid-retrain needs --set 'declared=[...]', the simulator's numbers to identify")
+    sac, env = load_sac(source_model, "cpu"), gym.make(target)
+    for name in ("observation_space", "action_space"):
+        of_agent, of_target = getattr(sac, name), getattr(env, name)
+        if of_agent.shape != of_target.shape:
+            raise ValueError(
+                f"ZIP {source_model!r} has {name} {of_agent}, TARGET {of_target}; name the agent of its task"
+            )
+    env.close()
+
+
+def _go_on(checkpoint: Path, given: Run, curve: SavedCurve) -> None:
+    """Learn on from a checkpoint to the end of the budget."""
+    from stable_baselines3.common.env_util import make_vec_env
+
+    from sb3_rpto.algorithms.transfer import TransferAlgorithm
+    from sb3_rpto.commands.runs import algorithm_of, load_checkpoint
+
+    if issubclass(algorithm_of(checkpoint), TransferAlgorithm):
+        source = make_vec_env(given.make_source, n_envs=given.n_source_envs)
+        model = load_checkpoint(checkpoint, source, target_env=given.make_target())
+    else:
+        model = load_checkpoint(checkpoint, given.make_target())
+    curve.restore(checkpoint)
+    model.learn(given.budget - model.num_timesteps, callback=curve, reset_num_timesteps=False)
