@@ -50,7 +50,7 @@ def rows(name: str, data: str, model: str, errors: list[HorizonError]) -> list[d
 def study(machine: Machine, out: Path, seed: int) -> tuple[list[dict[str, object]], dict[str, object]]:
     """Trace one machine: error rows and what was found."""
     began = time.perf_counter()
-    report = trace(machine.xml, machine.data, machine.declared, seed=seed)
+    report = trace(machine.xml, machine.data, machine.declared, seed=seed, horizon=machine.horizon)
     seconds = time.perf_counter() - began
     report.save(out / machine.name)
     print(f"\n===== {machine.name}, {seconds:.0f} s\n{report}")
