@@ -23,9 +23,9 @@ class MBPO(TransferAlgorithm):
     It is the loop of :class:`~sb3_rpto.RPTO` with RTO's weights left out (``weighting=None``), branches from states of
     D_target alone, and one batch for critic and actor alike: D_source with a share ``real_ratio`` of D_target.
 
-    What others change of it are four methods: ``_make_source_world`` (where branches start, which answer is kept: PDML,
-    PTP), ``_fit_to_transitions`` (how the model is fitted: PDML, PTP), ``_make_dynamics`` and ``update`` (another loss,
-    another policy optimiser: SLBO).
+    What others change of it are five methods: ``_make_source_world`` (where branches start, which answer is kept: PDML,
+    PTP), ``fit_weights`` and ``_fit_to_transitions`` (how the model is fitted: PDML, PTP), ``_make_dynamics`` and
+    ``update`` (another loss, another policy optimiser: SLBO).
 
     :param args: as those of :class:`~sb3_rpto.algorithms.transfer.TransferAlgorithm`
     :param kwargs: likewise, without those in :data:`UNUSED`; what is not passed is :meth:`published`
@@ -71,5 +71,4 @@ class MBPO(TransferAlgorithm):
 
     def sample_batches(self, count: int, batch_size: int) -> Iterator[tuple[ReplayBufferSamples, ReplayBufferSamples]]:
         """The critic's batches of RPTO, for the actor too."""
-        for critic_batch, _ in super().sample_batches(count, batch_size):
-            yield critic_batch, critic_batch
+        return ((batch, batch) for batch in self.critic_batches(count, batch_size))

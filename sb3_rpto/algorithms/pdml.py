@@ -12,6 +12,7 @@ import torch as th
 from sb3_rpto.algorithms.mbpo import MBPO
 from sb3_rpto.algorithms.source import BranchSource, SourceWorld
 from sb3_rpto.algorithms.update import RelativeUpdate
+from sb3_rpto.dynamics.base import Transitions
 
 #: Distances between policies are means over at most so many of the newest states of D_target.
 STATES = 5_000
@@ -150,13 +151,6 @@ class PDML(MBPO):
         weights = np.pad(weights, (max(0, size - len(weights)), 0), mode="edge")[-size:]
         return weights / weights.sum()
 
-    def _fit_to_transitions(self) -> None:
-        """As MBPO's, with the weights; a weighted loss is what the weighted sampler's batches give on average."""
-        assert self.dynamics is not None
-        self._adopt_target_rules()
-        data = self.transitions("target")
-        self.logger.record("dynamics/error_before", self.dynamics.error(data))
-        weights = th.as_tensor(self.row_weights(len(data)) * len(data), device=self.device).float()
-        for name, value in self.dynamics.fit(data, weights).items():
-            self.logger.record(f"dynamics/{name}", value)
-        self.logger.record("dynamics/error", self.dynamics.error(data))
+    def fit_weights(self, data: Transitions) -> th.Tensor:
+        """The sampler's, (n,): a weighted loss is what the weighted sampler's batches give on average."""
+        return th.as_tensor(self.row_weights(len(data)) * len(data), device=self.device).float()

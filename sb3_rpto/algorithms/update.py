@@ -141,17 +141,8 @@ class RelativeUpdate(SAC):
         self.policy.set_training_mode(False)  # values for the weights: no dropout, no new batch statistics
         data = self.transitions("target")
         self.logger.record("dynamics/error_before", self.dynamics.error(data))
-        weights = None
-        if self.weighting is not None:
-            weights = rto_weights(
-                self.weighting,
-                self._with_critic_rewards(data),
-                self.dynamics,
-                self.soft_value,
-                self.q_value,
-                self.gamma,
-                self.weight_floor,
-            )
+        weights = self.fit_weights(data)
+        if weights is not None:
             self.logger.record("rto/effective_samples", effective_sample_size(weights))
         for name, value in self.dynamics.fit(data, weights).items():
             self.logger.record(f"dynamics/{name}", value)
@@ -159,6 +150,21 @@ class RelativeUpdate(SAC):
         for name, value in self.dynamics.describe().items():
             self.logger.record(f"dynamics/{name}", value)
         self.logger.record("dynamics/error", self.dynamics.error(data))
+
+    def fit_weights(self, data: Transitions) -> th.Tensor | None:
+        """RTO's weight of each transition, (n,); None weighs all alike."""
+        if self.weighting is None:
+            return None
+        assert self.dynamics is not None
+        return rto_weights(
+            self.weighting,
+            self._with_critic_rewards(data),
+            self.dynamics,
+            self.soft_value,
+            self.q_value,
+            self.gamma,
+            self.weight_floor,
+        )
 
     def _adopt_target_rules(self) -> None:
         """From the first fit on the model is one of the target: let what is known of the task be the target's."""
@@ -172,19 +178,13 @@ class RelativeUpdate(SAC):
         The actor sees four batches of D_target, then one of D_source; D_source alone as long as D_target could not
         fill a batch; a policy that does not learn sees the critic's. All are gathered at once.
         """
-        if self._pretraining:  # plain SAC: one batch of the only world there is
-            yield from ((batch, batch) for batch in self._draw("source", count, batch_size))
-            return
-        seen = self.replay_buffer.target.size()
-        n_target = round(self.real_ratio * batch_size) if seen > 0 else 0
-        for_critic = self._draw("source", count, batch_size - n_target)
-        if n_target > 0:
-            for_critic = map(_concatenate, for_critic, self._draw("target", count, n_target))
-        if not self.updates_policy:
+        for_critic = self.critic_batches(count, batch_size)
+        if self._pretraining or not self.updates_policy:
             yield from ((batch, batch) for batch in for_critic)
             return
+        scarce = self.replay_buffer.target.size() < batch_size
         turns = [(self._actor_updates + i) % ALTERNATION == ALTERNATION - 1 for i in range(count)]
-        from_source = [turn or seen < batch_size for turn in turns]
+        from_source = [turn or scarce for turn in turns]
         for_actor = {
             True: self._draw("source", sum(from_source), batch_size),
             False: self._draw("target", count - sum(from_source), batch_size),
@@ -192,6 +192,13 @@ class RelativeUpdate(SAC):
         for turn, critic_batch in zip(from_source, for_critic):
             self._actor_updates += 1
             yield critic_batch, next(for_actor[turn])
+
+    def critic_batches(self, count: int, batch_size: int) -> Iterator[ReplayBufferSamples]:
+        """Batches of D_source with their share ``real_ratio`` of D_target; while pretraining of D_source alone."""
+        real = not self._pretraining and self.replay_buffer.target.size() > 0
+        n_target = round(self.real_ratio * batch_size) if real else 0
+        drawn = self._draw("source", count, batch_size - n_target)
+        return map(_concatenate, drawn, self._draw("target", count, n_target)) if n_target > 0 else drawn
 
     def _draw(self, world: World, count: int, batch_size: int) -> Iterator[ReplayBufferSamples]:
         """``count`` batches of one world, gathered at once, in the networks' precision."""

@@ -32,8 +32,8 @@ def test_model_and_data_are_rtos_without_weights():
 def test_with_the_critics_batch_for_the_actor_rpto_without_weights_is_mbpo(monkeypatch):
     ours = small(MBPO).learn(60, source_timesteps=0)
     theirs = small(RPTO, **UNWEIGHTED)
-    batches = theirs.sample_batches
-    monkeypatch.setattr(theirs, "sample_batches", lambda *numbers: ((batch, batch) for batch, _ in batches(*numbers)))
+    batches = theirs.critic_batches
+    monkeypatch.setattr(theirs, "sample_batches", lambda *numbers: ((batch, batch) for batch in batches(*numbers)))
     theirs.learn(60, source_timesteps=0)
     assert_same_worlds(ours, theirs)
     for name, value in ours.policy.state_dict().items():
