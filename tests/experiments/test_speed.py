@@ -1,4 +1,4 @@
-"""The speed benchmark: its plain versions do the same mathematics, its floor counts what is needed, its ratios add up."""
+"""The speed benchmark: its plain versions do the same mathematics, its floor counts what is needed, its ratios add."""
 
 import copy
 import json

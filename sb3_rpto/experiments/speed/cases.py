@@ -59,6 +59,9 @@ class Case:
 class Stage(gym.Env):
     """Spaces, and nothing that happens in them."""
 
+    observation_space: spaces.Box
+    action_space: spaces.Box
+
     def __init__(self, observation: int = OBSERVATION, action: int = ACTION) -> None:
         self.observation_space = spaces.Box(-np.inf, np.inf, (observation,), np.float64)
         self.action_space = spaces.Box(-1.0, 1.0, (action,), np.float32)
@@ -90,10 +93,11 @@ def update(device: str, count: int, observation: int = OBSERVATION, batch: int =
     stage = Stage(observation)
     sac = SAC("MlpPolicy", stage, seed=0, device=device, buffer_size=rows, batch_size=batch)
     rpo = RPO("MlpPolicy", stage, target_env=Stage(observation), seed=0, device=device, buffer_size=rows)
-    data = random_rows(rows, observation, ACTION)
+    data, memory = random_rows(rows, observation, ACTION), sac.replay_buffer
+    assert memory is not None
     for name, values in data.items():
-        getattr(sac.replay_buffer, name)[:, 0] = values
-    sac.replay_buffer.full = True
+        getattr(memory, name)[:, 0] = values
+    memory.full = True
     rpo.replay_buffer.append("source", **data)
     rpo.replay_buffer.append("target", **random_rows(min(rows, 5_000), observation, ACTION, 1))
     for model in (sac, rpo):
@@ -125,7 +129,7 @@ def ensemble_training(device: str, steps: int, members: int = 7, rows: int = 5_0
     models = {cls: _ensemble(cls, device, members) for cls in (EnsembleDynamics, PlainEnsemble)}
     trained = {cls: model._prepare(data, None)[0] for cls, model in models.items()}
     variants = {
-        name: (lambda cls=cls: _train(models[cls], trained[cls], steps))  # type: ignore[misc]
+        name: partial(_train, models[cls], trained[cls], steps)
         for name, cls in (("loop over members", PlainEnsemble), ("ours", EnsembleDynamics))
     }
     shapes: Shapes = Counter()
@@ -142,7 +146,7 @@ def rollouts(device: str, branches: int) -> Case:
     for model in models.values():
         model._prepare(_transitions(1_000, device), None)
     variants = {
-        name: (lambda cls=cls: models[cls].step(data.observations, data.actions))  # type: ignore[misc]
+        name: partial(models[cls].step, data.observations, data.actions)
         for name, cls in (("all, then gather", PlainEnsemble), ("ours", EnsembleDynamics))
     }
     shapes: Shapes = Counter()
@@ -159,14 +163,15 @@ def whole_loop(device: str, target_steps: int, fit_steps: int) -> Case:
     source = gym.make("HalfCheetah-v5")
     agent = SAC("MlpPolicy", source, seed=0, device=device, learning_starts=0, buffer_size=25_000)
     agent.learn(1)
-    agent.replay_buffer.reset()
+    memory = agent.replay_buffer
+    assert memory is not None
+    memory.reset()
     obs, _ = source.reset(seed=0)
     source.action_space.seed(0)
     for _ in range(25_000):  # what phi_0 is fitted to; fewer would be filled up in the source
         action = source.action_space.sample()
         following, reward, *_ = source.step(action)
-        row = (obs[None], following[None], action[None], np.array([reward]), np.array([False]), [{}])
-        agent.replay_buffer.add(*row)
+        memory.add(obs[None], following[None], action[None], np.array([reward]), np.array([False]), [{}])
         obs = following
 
     def learn(cls: type[RPTO]) -> Callable[[], Any]:
@@ -174,7 +179,7 @@ def whole_loop(device: str, target_steps: int, fit_steps: int) -> Case:
             agent,
             gym.make("HalfCheetah-v5"),
             target_env=gym.make("HalfCheetah-v5", reset_noise_scale=0.11),
-            source_data=agent.replay_buffer,
+            source_data=memory,
             seed=0,
             device=device,
             model_train_freq=target_steps,

@@ -127,12 +127,14 @@ class PlainRPTO(RPTO):
         optimizers = [self.actor.optimizer, self.critic.optimizer, self.ent_coef_optimizer]
         self._update_learning_rate(optimizers)  # type: ignore[arg-type]
         losses = []
+        log_ent_coef = self.log_ent_coef
+        assert log_ent_coef is not None  # it is learned
         for _ in range(gradient_steps):
             ((critic_batch, actor_batch),) = self.sample_batches(1, batch_size)
             actions_pi, log_prob = self.actor.action_log_prob(actor_batch.observations)
             log_prob = log_prob.reshape(-1, 1)
-            ent_coef = th.exp(self.log_ent_coef.detach())  # type: ignore[union-attr]
-            ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+            ent_coef = th.exp(log_ent_coef.detach())
+            ent_coef_loss = -(log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
             self.ent_coef_optimizer.zero_grad()  # type: ignore[union-attr]
             ent_coef_loss.backward()
             self.ent_coef_optimizer.step()  # type: ignore[union-attr]
