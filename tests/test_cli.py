@@ -140,7 +140,18 @@ def test_options_of_a_benchmark_are_passed_on(monkeypatch: pytest.MonkeyPatch) -
     assert cli.main(["benchmark", "tracing", "--help", "-x", "1"]) == 3
 
 
-@pytest.mark.parametrize(("command", "words"), [([], "trace"), (["trace"], "example:"), (["benchmark"], "tracing")])
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ([], "move a source agent to a target"),
+        (["train"], "sb3-rpto train Hopper --out"),
+        (["transfer"], "sb3-rpto transfer runs/"),
+        (["plot"], "sb3-rpto plot runs/"),
+        (["enjoy"], "--video hopper.mp4"),
+        (["trace"], "example:"),
+        (["benchmark"], "tracing"),
+    ],
+)
 def test_help_exits_with_0(command: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         cli.main([*command, "--help"])

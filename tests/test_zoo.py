@@ -236,7 +236,20 @@ def test_a_search_is_judged_on_the_target(zoo, agent, tmp_path, monkeypatch):
     monkeypatch.setattr(TransferManager, "create_envs", watched)
     search = ["-optimize", "--n-trials", "2", "--sampler", "random", "--pruner", "none", "--no-optim-plots"]
     judged = ["-n", "4", "--n-evaluations", "2", "--eval-episodes", "1"]
-    options = ["--algo", "rpo", "--env", TARGET, "-f", str(tmp_path), "--source-model", str(agent), "--seed", "1"]
+    study = ["--storage", str(tmp_path / "study.log"), "--study-name", "small"]
+    options = [
+        "--algo",
+        "rpo",
+        "--env",
+        TARGET,
+        "-f",
+        str(tmp_path),
+        "--source-model",
+        str(agent),
+        "--seed",
+        "1",
+        *study,
+    ]
     assert train.main([*options, *search, *judged, "--verbose", "0", "-params", "batch_size:16"]) == 0
     assert set(made) == {(False, SOURCE), (True, TARGET)}
     (report,) = (tmp_path / "rpo").glob("report_*.csv")
@@ -244,6 +257,12 @@ def test_a_search_is_judged_on_the_target(zoo, agent, tmp_path, monkeypatch):
         rows = list(csv.DictReader(stream))
     assert [row["state"] for row in rows] == ["COMPLETE", "COMPLETE"]
     assert all(float(row["value"]) > 0 and 1 <= int(row["params_gradient_steps"]) <= 40 for row in rows)
+    again = launch(
+        tmp_path, "rpo", "--source-model", str(agent), "-n", "4", "--eval-freq", "-1", *study, "--trial-id", "1"
+    )
+    model = RPO.load(final(again), device="cpu")
+    assert model.gradient_steps == int(rows[1]["params_gradient_steps"])
+    assert model.lr_schedule(1.0) == pytest.approx(float(rows[1]["params_learning_rate"]))  # not the source agent's
 
 
 # ---------------------------------------------------------------------- wrong arguments

@@ -53,7 +53,6 @@ def add(commands: Any) -> None:
 
 def run(parsed: argparse.Namespace) -> int:
     """Evaluate, then film."""
-    import gymnasium as gym
     import numpy as np
 
     from sb3_rpto.commands.policies import load_policy
@@ -62,15 +61,15 @@ def run(parsed: argparse.Namespace) -> int:
     if not parsed.seconds > 0:
         raise ValueError(f"--seconds is {parsed.seconds:g}; give a time above 0")
     model, known = _model(parsed.model)
-    target = parsed.target or known.get("target")
-    if target is None:
+    name = parsed.target or known.get("target")
+    if name is None:
         raise ValueError(f"MODEL {str(parsed.model)!r} is a zip: pass TARGET, the id of the world to run it in")
-    target = options.environment(target, "TARGET")
+    target = options.world(name, "TARGET")
     policy = load_policy(model, "MODEL")
     _check_spaces(policy, target, "MODEL", "TARGET")
     shown = _shown(parsed, known, target) if parsed.video is not None else None
 
-    env = gym.make(target)
+    env = target.make()
     returns = []
     for episode in range(parsed.episodes):
         returns.append(_episode(env, policy, parsed.seed if episode == 0 else None, not parsed.stochastic))
@@ -93,7 +92,7 @@ def _model(path: Path) -> tuple[Path, dict[str, Any]]:
     return path / "model.zip", {name: value for name, value in known.items() if value is not None}
 
 
-def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: str) -> tuple[Policy, str]:
+def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: options.World) -> tuple[Policy, options.World]:
     """The source policy and the source of a film; all that can fail does so here, before anything is run."""
     from sb3_rpto.commands import video
     from sb3_rpto.commands.policies import load_policy
@@ -105,28 +104,26 @@ def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: str) -> tu
     agent = parsed.source_model or known.get("source_model")
     if agent is None:
         raise ValueError("--video compares with the source policy: pass its zip by --source-model")
-    source = parsed.source or known.get("source") or source_of(target.rpartition(":")[2])
-    if source is None:
-        raise ValueError(f"TARGET {target!r} is none of our targets, so its source is not known: pass --source ID")
+    name = parsed.source or known.get("source") or source_of(target.env_id)
+    if name is None:
+        raise ValueError(f"TARGET {target.name!r} is none of our targets: pass the source's id by --source ID")
     options.check_file(agent, "--source-model")
-    source = options.environment(source, "--source")
+    source = options.world(name, "--source")
     policy = load_policy(agent, "--source-model")
     _check_spaces(policy, source, "--source-model", "--source")
     return policy, source
 
 
-def _check_spaces(policy: Policy, env_id: str, argument: str, world: str) -> None:
+def _check_spaces(policy: Policy, world: options.World, argument: str, of: str) -> None:
     """Refuse a policy of another task.
 
     :raises ValueError: naming the argument
     """
-    import gymnasium as gym
-
-    env = gym.make(env_id)
+    env = world.make()
     for name in ("observation_space", "action_space"):
         of_policy, of_env = getattr(policy, name), getattr(env, name)
         if of_policy.shape != of_env.shape:
-            raise ValueError(f"{argument} has {name} {of_policy}, {world} {env_id!r} has {of_env}; name the same task")
+            raise ValueError(f"{argument} has {name} {of_policy}, {of} {world.name!r} has {of_env}; name the same task")
     env.close()
 
 
@@ -141,12 +138,12 @@ def _episode(env: Any, policy: Policy, seed: int | None, deterministic: bool) ->
     return total
 
 
-def _film(parsed: argparse.Namespace, policy: Policy, target: str, source_policy: Policy, source: str) -> None:
-    import gymnasium as gym
-
+def _film(
+    parsed: argparse.Namespace, policy: Policy, target: options.World, source_policy: Policy, source: options.World
+) -> None:
     from sb3_rpto.commands.video import Panel, film
 
-    in_source, in_target = (partial(gym.make, name, render_mode="rgb_array") for name in (source, target))
+    in_source, in_target = (partial(world.make, render_mode="rgb_array") for world in (source, target))
     panels = [
         Panel("source policy in the source", source_policy, in_source),
         Panel("source policy in the target (zero-shot)", source_policy, in_target),

@@ -7,9 +7,14 @@ import contextlib
 import difflib
 import importlib
 import inspect
-from collections.abc import Callable, Iterable
+import re
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import gymnasium as gym
 
 
 def add_common(parser: argparse.ArgumentParser, of_target: str = "") -> None:
@@ -74,27 +79,66 @@ def check_file(path: str | Path | None, argument: str) -> None:
         raise FileNotFoundError(f"{argument}: there is no file {str(path)!r}; check the path")
 
 
-def check_names(given: Iterable[str], function: Callable[..., Any], beside: Iterable[str] = ()) -> None:
-    """Refuse settings that a function does not take.
+def constructor_names(cls: type) -> set[str]:
+    """Names that a class's constructor takes, its parents' included."""
+    constructors = [vars(parent)["__init__"] for parent in cls.__mro__ if "__init__" in vars(parent)]
+    return {name for function in constructors[:-1] for name in inspect.signature(function).parameters}
+
+
+def check_names(given: Iterable[str], known: Collection[str]) -> None:
+    """Refuse settings that do not exist.
 
     :param given: names
-    :param function: whose parameters they are
-    :param beside: names that are good too
+    :param known: names that do
     :raises ValueError: naming the first wrong one, and what was perhaps meant
     """
-    known = {*inspect.signature(function).parameters, *beside}
     for name in given:
         if name not in known:
             raise ValueError(f"--set {name}: there is no such argument{_perhaps(name, known)}")
 
 
-def environment(name: str, argument: str) -> str:
-    """The gymnasium id that a user means by the name of a task, an id, or ``package:id``; it can be made.
+@dataclass(frozen=True)
+class World:
+    """An environment by the name that the user gave it.
 
-    :param name: ``Hopper``, ``rpto/Hopper-target0-v0``, ``Pendulum-v1``, ``package:name/Task-v0``
+    :param name: id, also of a shift of ours that is not registered
+    :param env_id: that gymnasium knows
+    :param kwargs: that make the rest of it
+    """
+
+    name: str = field(compare=False)
+    env_id: str
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+    def make(self, **more: Any) -> gym.Env:
+        """The environment.
+
+        :param more: arguments of ``gymnasium.make``
+        """
+        import gymnasium as gym
+
+        return gym.make(self.env_id, **self.kwargs, **more)
+
+
+def world(name: str, argument: str) -> World:
+    """The environment that a user means by the name of a task, an id, or ``package:id``; it can be made.
+
+    :param name: ``Hopper``, ``rpto/Hopper-target0-v0``, any shift (``rpto/Hopper-gravity-x3-v0``), ``Pendulum-v1``,
+        ``package:name/Task-v0``
     :param argument: what the user passed it as
     :raises ValueError: for an environment that does not exist or whose packages are missing
     """
+    import gymnasium as gym
+
+    found = _find(name, argument)
+    try:
+        found.make().close()
+    except (gym.error.Error, ImportError, ValueError) as error:
+        raise ValueError(f"{argument} {name!r} cannot be made: {error}") from error
+    return found
+
+
+def _find(name: str, argument: str) -> World:
     import gymnasium as gym
 
     from sb3_rpto.envs import tasks
@@ -107,13 +151,12 @@ def environment(name: str, argument: str) -> str:
             importlib.import_module(package)
         except ImportError as error:
             raise ValueError(f"{argument} {name!r}: {package} cannot be imported ({error})") from error
-    if env_id not in gym.registry:
-        raise ValueError(f"{argument} {name!r} is no environment{_perhaps(env_id, [*gym.registry, *tasks.TASKS])}")
-    try:
-        gym.make(name).close()
-    except (gym.error.Error, ImportError) as error:
-        raise ValueError(f"{argument} {name!r} cannot be made: {error}") from error
-    return name
+    if env_id in gym.registry:
+        return World(name, env_id)
+    shifted = re.fullmatch(r"rpto/(\w+)-(.+)-v0", env_id)
+    if shifted and shifted[1] in tasks.TASKS:
+        return World(name, tasks.env_id(shifted[1]), {"shift": shifted[2]})
+    raise ValueError(f"{argument} {name!r} is no environment{_perhaps(env_id, [*gym.registry, *tasks.TASKS])}")
 
 
 def _perhaps(name: str, known: Iterable[str]) -> str:

@@ -74,7 +74,7 @@ def read_rows(paths: Sequence[Path]) -> list[dict[str, Any]]:
         for file in files:
             found = _result(file)
             if found is None and not path.is_dir():
-                raise ValueError(f"RESULT {file} is no result file: it has no rows with method, seed, steps and return")
+                raise ValueError(f"RESULT {file} is no result file of sb3-rpto")
             rows += found or []
     if not rows:
         raise ValueError(f"RESULT: there are no result files in {', '.join(map(str, paths))}")
@@ -82,14 +82,17 @@ def read_rows(paths: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 def _result(file: Path) -> list[dict[str, Any]] | None:
-    """The rows of a file; None for one that is something else."""
+    """The rows of a file of ``sb3-rpto transfer``, ``train`` or ``benchmark transfer``; None for another file."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-        config = content.get("config", {})
-        target = config.get("target", "")
-        rows = content["rows"]
-        return [{"target": target, **{key: row[key] for key in ("method", "seed", "steps", "return")}} for row in rows]
-    except (ValueError, KeyError, TypeError, AttributeError):
+        if "job" in content:  # of the benchmark: a method with its settings has a label
+            of_run = {"method": content["job"]["label"], "target": content["target"]["id"]}
+            of_run["target"] += f" {content['target']['shift']}"
+            of_run["seed"] = content["job"]["seed"]
+        else:
+            of_run = {name: content["config"][name] for name in ("method", "target", "seed")}
+        return [{**of_run, "steps": row["steps"], "return": row["return"]} for row in content["rows"]]
+    except (ValueError, KeyError, TypeError):
         return None
 
 

@@ -57,7 +57,7 @@ class RunFolder:
         run, asked = cls(path), json.loads(json.dumps(config))
         path.mkdir(parents=True, exist_ok=True)
         file = path / "config.json"
-        if not file.exists():
+        if not run.result.exists() and run.newest_checkpoint() is None:  # there is nothing to keep
             run._write_json(file, asked)
             return run
         kept = json.loads(file.read_text(encoding="utf-8"))
@@ -183,7 +183,8 @@ class SavedCurve(LearningCurve):
         super()._on_step()
         if isinstance(self.model, TransferAlgorithm):
             self._save()
-        return self.until is None or self.rows[-1]["return"] < self.until
+        last = self.rows[-1]
+        return self.until is None or last["steps"] < self.num_timesteps or last["return"] < self.until
 
     def _save(self) -> None:
         if not self._unsaved:

@@ -42,7 +42,6 @@ def add(commands: Any) -> None:
 
 def run(parsed: argparse.Namespace) -> int:
     """Train, or go on with it."""
-    import gymnasium as gym
     from stable_baselines3 import SAC
 
     from sb3_rpto.algorithms.checkpoint import write_atomically
@@ -50,29 +49,36 @@ def run(parsed: argparse.Namespace) -> int:
     from sb3_rpto.zoo.settings import shipped_settings
 
     options.check_positive(parsed, "steps", "every", "episodes")
-    env_id = options.environment(parsed.task, "TASK")
-    settings = {**shipped_settings("sac", env_id), **dict(parsed.set)}
+    task = options.world(parsed.task, "TASK")
+    settings = {**shipped_settings("sac", task.env_id), **dict(parsed.set)}
     steps = int(settings.pop("n_timesteps") if parsed.steps is None else parsed.steps)
     settings.pop("n_timesteps", None)
-    options.check_names(settings, SAC.__init__)
+    options.check_names(settings, options.constructor_names(SAC))
+    settings.setdefault("buffer_size", min(1_000_000, steps))  # SAC's, but no larger a file than there is to keep
     every = parsed.every or max(steps // 10, 1)
     config = {
-        **{"command": "train", "method": "sac", "source": None, "target": env_id, "steps": steps, "seed": parsed.seed},
-        **{"every": every, "episodes": parsed.episodes, "until": parsed.until, "settings": settings},
+        "command": "train",
+        "method": "sac",
+        "target": task.name,
+        "steps": steps,
+        "seed": parsed.seed,
+        "settings": settings,
+        "every": every,
+        "episodes": parsed.episodes,
+        "until": parsed.until,
     }
     folder = RunFolder.open(parsed.out, config)
     if folder.result.exists():
         print(f"trained already: {folder.model}")
         return 0
-    make = partial(gym.make, env_id)
     say = None if parsed.quiet else partial(print, flush=True)
-    curve = SavedCurve(folder, make, every, steps, parsed.episodes, parsed.seed, until=parsed.until, say=say)
+    curve = SavedCurve(folder, task.make, every, steps, parsed.episodes, parsed.seed, until=parsed.until, say=say)
     checkpoint = folder.newest_checkpoint()
     model: Any
     if checkpoint is None:
-        model = SAC(env=make(), seed=parsed.seed, device=parsed.device, **settings)
+        model = SAC(env=task.make(), seed=parsed.seed, device=parsed.device, **settings)
     else:
-        model = load_checkpoint(checkpoint, make(), device=parsed.device)
+        model = load_checkpoint(checkpoint, task.make(), device=parsed.device)
         curve.restore(checkpoint)
     model.learn(steps - model.num_timesteps, callback=curve, reset_num_timesteps=checkpoint is None)
     curve.env.close()

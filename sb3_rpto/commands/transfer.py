@@ -29,11 +29,10 @@ example:
 writes into DIR model.zip and result.json (configuration and learning curve).
 """
 
-#: Methods that load SAC's zip with settings, which SB3 does not check; what they take beside SAC's arguments.
-LOADING = {
-    **dict.fromkeys(("zero-shot", "sac-warm", "sac-mixed", "oracle"), ()),
-    "sac-warm-high": ("n_critics",),
-    "sysid-retrain": ("declared", "retrain_steps", "max_steps", "dynamics_kwargs"),
+#: What methods that load SAC's zip take beside SAC's arguments.
+BESIDE_SAC = {
+    "sac-warm-high": {"n_critics"},
+    "sysid-retrain": {"declared", "retrain_steps", "max_steps", "dynamics_kwargs"},
 }
 #: Methods that begin anew: nothing is learned step by step, or in two parts.
 NOT_RESUMABLE = ("zero-shot", "sysid-retrain")
@@ -65,8 +64,6 @@ def add(commands: Any) -> None:
 
 def run(parsed: argparse.Namespace) -> int:
     """Transfer, or go on with it."""
-    import gymnasium as gym
-
     from sb3_rpto.algorithms.checkpoint import write_atomically
     from sb3_rpto.commands.runs import RunFolder, SavedCurve
     from sb3_rpto.experiments.methods import REGISTRY, Run
@@ -77,17 +74,25 @@ def run(parsed: argparse.Namespace) -> int:
         raise ValueError(f"--method {parsed.method!r} does not exist; choose one of {', '.join(REGISTRY)}")
     options.check_file(parsed.source_model, "ZIP")
     options.check_file(parsed.source_data, "--source-data")
-    target = options.environment(parsed.target, "TARGET")
+    target = options.world(parsed.target, "TARGET")
     source = _source(parsed, target)
     settings = dict(parsed.set)
     _check(parsed.method, settings, parsed.source_model, target)
-    budget = shipped_settings(parsed.method if parsed.method in ALGORITHMS else "rpto", target)["n_timesteps"]
+    budget = shipped_settings(parsed.method if parsed.method in ALGORITHMS else "rpto", target.env_id)["n_timesteps"]
     steps = parsed.steps or budget
     every = parsed.every or max(steps // 10, 1)
     config = {
-        **{"command": "transfer", "method": parsed.method, "source": source, "target": target, "steps": steps},
-        **{"seed": parsed.seed, "source_model": str(parsed.source_model), "source_data": parsed.source_data},
-        **{"every": every, "episodes": parsed.episodes, "settings": settings},
+        "command": "transfer",
+        "method": parsed.method,
+        "source": source.name,
+        "target": target.name,
+        "steps": steps,
+        "seed": parsed.seed,
+        "settings": settings,
+        "source_model": parsed.source_model,
+        "source_data": parsed.source_data,
+        "every": every,
+        "episodes": parsed.episodes,
     }
     folder = RunFolder.open(parsed.out, config)
     if folder.result.exists():
@@ -96,8 +101,8 @@ def run(parsed: argparse.Namespace) -> int:
     method = REGISTRY[parsed.method]
     given = Run(
         parsed.source_model,
-        partial(gym.make, source),
-        partial(gym.make, target),
+        source.make,
+        target.make,
         steps,
         parsed.seed,
         source_data=parsed.source_data,
@@ -129,44 +134,56 @@ def run(parsed: argparse.Namespace) -> int:
     return 0
 
 
-def _source(parsed: argparse.Namespace, target: str) -> str:
-    """The id of the source.
+def _source(parsed: argparse.Namespace, target: options.World) -> options.World:
+    """The source.
 
     :raises ValueError: where it is not known, or is the target
     """
     from sb3_rpto.zoo.settings import source_of
 
-    source = parsed.source or source_of(target.rpartition(":")[2])
-    if source is None:
-        raise ValueError(f"TARGET {target!r} is none of our targets, so its source is not known: pass --source ID")
-    source = options.environment(source, "--source")
+    name = parsed.source or source_of(target.env_id)
+    if name is None:
+        raise ValueError(f"TARGET {target.name!r} is none of our targets: pass the source's id by --source ID")
+    source = options.world(name, "--source")
     if source == target:
-        raise ValueError(f"TARGET {target!r} is the source itself; name another world (docs/tasks.md)")
+        raise ValueError(f"TARGET {target.name!r} is the source itself; name another world (docs/tasks.md)")
     return source
 
 
-def _check(method: str, settings: dict[str, Any], source_model: str, target: str) -> None:
+def _check(method: str, settings: dict[str, Any], source_model: str, target: options.World) -> None:
     """Refuse what would fail later: a zip of another task, settings that the method does not know.
 
     :raises ValueError: naming the argument
     """
-    import gymnasium as gym
-    from stable_baselines3 import SAC
-
     from sb3_rpto.algorithms.warm import load_sac
 
-    if method in LOADING:
-        options.check_names(settings, SAC.__init__, LOADING[method])
+    options.check_names(settings, _known_settings(method))
     if method == "sysid-retrain" and not settings.get("declared"):
         raise ValueError("--method sysid-retrain needs --set 'declared=[...]', the simulator's numbers to identify")
-    sac, env = load_sac(source_model, "cpu"), gym.make(target)
+    sac, env = load_sac(source_model, "cpu"), target.make()
     for name in ("observation_space", "action_space"):
         of_agent, of_target = getattr(sac, name), getattr(env, name)
         if of_agent.shape != of_target.shape:
-            raise ValueError(
-                f"ZIP {source_model!r} has {name} {of_agent}, TARGET {of_target}; name the agent of its task"
-            )
+            raise ValueError(f"ZIP {source_model!r} has {name} {of_agent}, TARGET {of_target}; name its task's agent")
     env.close()
+
+
+def _known_settings(method: str) -> set[str]:
+    """Names that a method takes.
+
+    :raises ImportError: without sb3-contrib, where it is needed
+    """
+    from stable_baselines3 import SAC
+
+    from sb3_rpto.zoo.settings import ALGORITHMS
+
+    if method in ALGORITHMS:
+        return options.constructor_names(ALGORITHMS[method])
+    if method == "trpo-warm":
+        from sb3_contrib import TRPO
+
+        return options.constructor_names(TRPO)
+    return options.constructor_names(SAC) | BESIDE_SAC.get(method, set())
 
 
 def _go_on(checkpoint: Path, given: Run, curve: SavedCurve) -> None:

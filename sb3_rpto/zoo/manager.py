@@ -77,6 +77,7 @@ class TransferManager(ExperimentManager):
         if start is not None and not self.optimize_hyperparameters:
             self.continue_training = True  # the zoo then asks _load_pretrained_agent for the model
         self._n_source_envs = 1
+        self._asked = set(self.custom_hyperparams or {})
 
     # ------------------------------------------------------------------ settings
 
@@ -89,6 +90,12 @@ class TransferManager(ExperimentManager):
             return super().read_hyperparameters()
         finally:
             self.env_name = env_name
+
+    def load_trial(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """As the zoo's; a trial's parameters win over what a source agent brings along."""
+        found = super().load_trial(*args, **kwargs)
+        self._asked |= found.keys()
+        return found
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         """As the zoo's; with two worlds ``n_envs`` is taken to be the source's, callbacks count target steps."""
@@ -157,8 +164,7 @@ class TransferManager(ExperimentManager):
                 hyperparams["learning_starts"] = 0  # a trained agent takes no random steps
             return super()._load_pretrained_agent(hyperparams, env)
         if not self.resumes:
-            asked = self.custom_hyperparams or {}
-            return self._begin(self.start, hyperparams, asked, env, self.create_target(), seed=self.seed)
+            return self._begin(self.start, hyperparams, self._asked, env, self.create_target(), seed=self.seed)
         if self.custom_hyperparams:
             raise ValueError("--trained-agent goes on with the settings that it was saved with; leave -params out")
         print(f"Resuming {self.trained_agent}")
@@ -264,7 +270,7 @@ class TransferManager(ExperimentManager):
             eval_freq=max(self.n_timesteps // self.n_evaluations, 1),
             deterministic=self.deterministic_eval,
         )
-        asked = {*(self.custom_hyperparams or {}), *sampled}
+        asked = self._asked | sampled.keys()
         verbose = self.verbose if self.verbose >= 2 else 0
         model = self._begin(self.start, merged, asked, source, target, seed=None, verbose=verbose)
         try:

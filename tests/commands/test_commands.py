@@ -1,0 +1,328 @@
+"""The commands train, transfer, plot and enjoy: what they write, how they resume, what they say of wrong input."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.save_util import load_from_pkl
+
+from sb3_rpto import RPO, RPTO, cli
+from sb3_rpto.algorithms.slbo import SLBO
+from sb3_rpto.commands import video
+from sb3_rpto.commands.plot import read_rows
+from sb3_rpto.commands.policies import load_policy
+from sb3_rpto.commands.runs import RunFolder, SavedCurve
+
+SOURCE, TARGET = "rpto/ContinuousCartPole-v0", "rpto/ContinuousCartPole-limb-x2-v0"
+SMALL_SAC = ["--set", "policy_kwargs={net_arch: [16]}", "--set", "learning_starts=20"]
+JUDGED = ["--every", "20", "--episodes", "2", "--quiet"]
+FEW = ["--set", "source_steps=2", "--set", "gradient_steps=1"]
+PHYSICAL = ["--set", "dynamics=physical", "--set", "declared=[pole_length]"]
+STAGES = ["iterations=1", "policy_updates=1", "model_steps=2", "rollout_samples=20", "rollout_length=10"]
+SETTINGS = {
+    **{"zero-shot": [], "sac": SMALL_SAC, "sac-warm": [], "sac-mixed": [], "trpo-warm": []},
+    **{"rpo": FEW, "rto": [*FEW, *PHYSICAL], "rpto": [*FEW, *PHYSICAL]},
+    "sysid-retrain": ["--set", "declared=[pole_length]", "--set", "max_steps=2", "--set", "retrain_steps=20"],
+    "slbo": [text for stage in [*STAGES, "model_train_freq=20"] for text in ("--set", stage)],
+}
+
+
+def train(out: Path, *options: str) -> int:
+    return cli.main(["train", "ContinuousCartPole", "--out", str(out), "--steps", "60", *JUDGED, *SMALL_SAC, *options])
+
+
+@pytest.fixture(scope="module")
+def agent(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a source agent, hardly trained."""
+    folder = tmp_path_factory.mktemp("agent")
+    assert train(folder, "--device", "cpu") == 0
+    return folder
+
+
+def transfer(agent: Path, out: Path, method: str, *options: str, target: str = TARGET) -> int:
+    data = ["--source-data", str(agent / "replay_buffer.pkl")]
+    given = ["transfer", str(agent / "model.zip"), target, "--method", method, *data, "--out", str(out)]
+    return cli.main([*given, "--steps", "60", *JUDGED, *SETTINGS[method], *options])
+
+
+def rows(out: Path) -> list[dict]:
+    """The learning curve, without what differs from run to run."""
+    found = json.loads((out / "result.json").read_text())["rows"]
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in found]
+
+
+def interrupt_at(steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kill the run at an evaluation."""
+    evaluate = SavedCurve.evaluate
+
+    def interrupted(self: SavedCurve, model: SAC, at: int) -> None:
+        if at == steps:
+            raise KeyboardInterrupt
+        evaluate(self, model, at)
+
+    monkeypatch.setattr(SavedCurve, "evaluate", interrupted)
+
+
+def error(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line on stderr."""
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.splitlines()
+    assert line.startswith("sb3-rpto: error: ")
+    return line
+
+
+# ---------------------------------------------------------------------- train
+
+
+def test_train_writes_agent_data_and_result(agent: Path) -> None:
+    assert sorted(path.name for path in agent.iterdir()) == [
+        *("config.json", "model.zip", "replay_buffer.pkl", "result.json")
+    ]
+    model = SAC.load(agent / "model.zip", device="cpu")
+    assert (model.num_timesteps, model.gamma) == (60, 0.98)  # gamma is of hyperparams/zoo/sac.yml
+    assert load_from_pkl(agent / "replay_buffer.pkl").size() == 60
+    assert [(row["method"], row["steps"]) for row in rows(agent)] == [("sac", n) for n in (0, 20, 40, 60)]
+    result = json.loads((agent / "result.json").read_text())
+    assert result["config"]["target"] == SOURCE
+    assert result["config"]["settings"]["learning_starts"] == 20
+
+
+def test_a_killed_training_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        interrupt_at(60, patch)
+        assert train(tmp_path) == 130
+    assert not (tmp_path / "result.json").exists()
+    assert train(tmp_path) == 0
+    assert [row["steps"] for row in rows(tmp_path)] == [0, 20, 40, 60]
+    assert SAC.load(tmp_path / "model.zip", device="cpu").num_timesteps == 60
+    assert load_from_pkl(tmp_path / "replay_buffer.pkl").size() == 60
+    assert not (tmp_path / "checkpoints").exists()
+
+
+def test_training_ends_at_a_return_that_suffices(tmp_path: Path) -> None:
+    assert train(tmp_path, "--until", "1") == 0
+    assert [row["steps"] for row in rows(tmp_path)] == [0, 20]
+
+
+def test_a_finished_run_is_not_repeated_and_not_overwritten(agent: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (agent / "model.zip").stat().st_mtime_ns
+    assert train(agent) == 0
+    assert "trained already" in capsys.readouterr().out
+    assert train(agent, "--seed", "1") == 2
+    assert "holds a run with seed=0, not 1" in error(capsys)
+    assert (agent / "model.zip").stat().st_mtime_ns == before
+
+
+# ---------------------------------------------------------------------- transfer
+
+
+@pytest.mark.parametrize("method", SETTINGS)
+def test_every_kind_of_method_leaves_model_and_result(method: str, agent: Path, tmp_path: Path) -> None:
+    assert transfer(agent, tmp_path, method) == 0
+    steps = [row["steps"] for row in rows(tmp_path)]
+    assert steps == ([0] if method == "zero-shot" else [0, 20, 40, 60])
+    observation = gym.make(TARGET).reset(seed=0)[0]
+    loaded = load_policy(tmp_path / "model.zip", "MODEL").predict(observation, deterministic=True)[0]
+    classes = {"rpo": RPO, "rpto": RPTO, "slbo": SLBO}
+    if method in classes:
+        model = classes[method].load(tmp_path / "model.zip", device="cpu")
+        assert model.num_timesteps == sum(model.target_spent.values()) == 60
+        np.testing.assert_array_equal(loaded, model.predict(observation, deterministic=True)[0])
+    assert loaded.shape == (1,)
+
+
+@pytest.mark.parametrize("method", ["rpo", "rpto", "slbo", "sac-mixed", "trpo-warm"])
+def test_a_killed_transfer_goes_on(
+    method: str, agent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    killed, unbroken = tmp_path / "killed", tmp_path / "unbroken"
+    with monkeypatch.context() as patch:
+        interrupt_at(60, patch)
+        assert transfer(agent, killed, method) == 130
+    assert list((killed / "checkpoints").iterdir())
+    assert transfer(agent, killed, method) == 0
+    assert [row["steps"] for row in rows(killed)] == [0, 20, 40, 60]
+    if method in ("rpo", "rpto"):  # bit for bit, as our checkpoints are
+        assert transfer(agent, unbroken, method) == 0
+        assert rows(killed) == rows(unbroken)
+        states = [load_policy(out / "model.zip", "MODEL").state_dict() for out in (killed, unbroken)]
+        assert all(th.equal(value, states[1][name]) for name, value in states[0].items())
+
+
+def test_any_shift_is_a_target(agent: Path, tmp_path: Path) -> None:
+    assert transfer(agent, tmp_path, "zero-shot", target="rpto/ContinuousCartPole-limb-x3-v0") == 0
+    longer = rows(tmp_path)[0]["return"]
+    assert transfer(agent, tmp_path / "other", "zero-shot") == 0
+    assert rows(tmp_path / "other")[0]["return"] != longer
+
+
+def test_the_budget_is_that_of_the_task(agent: Path, tmp_path: Path) -> None:
+    given = ["transfer", str(agent / "model.zip"), TARGET, "--method", "zero-shot", "--episodes", "1", "--quiet"]
+    assert cli.main([*given, "--out", str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "config.json").read_text())["steps"] == 1_000
+
+
+def test_a_checkpoint_is_replaced_as_a_whole(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path, {"a": 1})
+    run.save_checkpoint(1, lambda folder: (folder / "model.zip").write_text("first") and None)
+
+    def killed(folder: Path) -> None:
+        (folder / "model.zip").write_text("half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run.save_checkpoint(2, killed)
+    assert (run.newest_checkpoint() / "model.zip").read_text() == "first"
+    run.save_checkpoint(3, lambda folder: (folder / "model.zip").write_text("third") and None)
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["0000000003"]
+    with pytest.raises(ValueError, match="a=1, not 2"):
+        RunFolder.open(tmp_path, {"a": 2})
+
+
+# ---------------------------------------------------------------------- plot
+
+
+def test_plot_draws_results_of_all_commands(agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib", reason="the extra 'experiments' is not installed")
+    of_benchmark = {
+        "job": {"label": "rpto-physical", "seed": 1},
+        "target": {"id": SOURCE, "shift": "limb-x2"},
+        "rows": [{"steps": n, "return": 10.0 + n} for n in (0, 20)],
+    }
+    for seed in (1, 2):
+        of_benchmark["job"]["seed"] = seed
+        (tmp_path / f"{seed}.json").write_text(json.dumps(of_benchmark))
+    found = read_rows([agent, tmp_path])
+    assert [(row["method"], row["seed"]) for row in found] == [("sac", 0)] * 4 + [
+        *(("rpto-physical", 1),) * 2,
+        *(("rpto-physical", 2),) * 2,
+    ]
+    assert {row["target"] for row in found} == {SOURCE, f"{SOURCE} limb-x2"}
+    assert cli.main(["plot", str(agent), str(tmp_path), "--out", str(tmp_path / "figure.png")]) == 0
+    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+    assert "8 evaluations of 2 target(s)" in capsys.readouterr().out
+
+
+# ---------------------------------------------------------------------- enjoy
+
+
+def test_enjoy_prints_what_the_policy_earns(agent: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["enjoy", str(agent), "--episodes", "2", "--seed", "5"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    model, env = SAC.load(agent / "model.zip", device="cpu"), gym.make(SOURCE)
+    for line, seed in zip(printed, (5, None)):
+        observation, total, over = env.reset(seed=seed)[0], 0.0, False
+        while not over:
+            observation, reward, terminated, truncated, _ = env.step(model.predict(observation, deterministic=True)[0])
+            total, over = total + reward, terminated or truncated
+        assert line.endswith(f"return {total:.1f}")
+    assert printed[2].endswith("2 episodes")
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_a_film_shows_three_panels(suffix: str, agent: Path, tmp_path: Path) -> None:
+    imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")
+    if suffix == ".mp4":
+        pytest.importorskip("imageio_ffmpeg", reason="the extra 'video' is not installed")
+    assert transfer(agent, tmp_path / "run", "zero-shot") == 0
+    file = tmp_path / f"film{suffix}"
+    assert cli.main(["enjoy", str(tmp_path / "run"), "--episodes", "1", "--video", str(file), "--seconds", "0.2"]) == 0
+    frames = [frame for frame in imageio.get_reader(file)]  # noqa: C416 (list() asks for the length, which is infinite)
+    assert frames[0].shape[:2] == (440, 3 * 604)  # a caption above, a gap beside each
+    assert len(frames) > 5
+    assert not np.array_equal(frames[0], frames[-1])
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+def test_a_film_of_mujoco_without_a_display(tmp_path: Path) -> None:
+    pytest.importorskip("imageio", reason="the extra 'video' is not installed")
+    try:
+        env = gym.make("rpto/Hopper-v0", render_mode="rgb_array")
+        env.reset()
+        env.render()
+    except Exception as problem:
+        pytest.skip(f"MuJoCo cannot draw here: {problem}")
+    SAC("MlpPolicy", env, policy_kwargs={"net_arch": [16]}, device="cpu").save(tmp_path / "hopper.zip")
+    env.close()
+    agent, file = str(tmp_path / "hopper.zip"), tmp_path / "film.gif"
+    options = ["--source-model", agent, "--episodes", "1", "--video", str(file), "--seconds", "0.1"]
+    assert cli.main(["enjoy", agent, "rpto/Hopper-limb-x2-v0", *options]) == 0
+    assert file.stat().st_size > 1_000
+
+
+# ---------------------------------------------------------------------- wrong input
+
+BAD = {
+    "train Hoper --out O": "did you mean 'Hopper'",
+    "train rpto/Hopper-targt0-v0 --out O": "registered for Hopper are target0",
+    "train rpto/ContinuousCartPole-push-x2-v0 --out O": "shift='push-x2' does not exist",
+    "train no_such_package:X-v0 --out O": "no_such_package cannot be imported",
+    "train ContinuousCartPole --out O --set gama=1": "--set gama: there is no such argument; did you mean 'gamma'",
+    "train ContinuousCartPole --out O --set gamma": "'gamma' is not NAME=VALUE",
+    "train ContinuousCartPole --out O --steps 0": "--steps is 0",
+    "train ContinuousCartPole --out O --every -1": "--every is -1",
+    "train ContinuousCartPole": "--out",
+    "transfer absent.zip T --out O": "ZIP: there is no file 'absent.zip'",
+    "transfer A/config.json T --out O": "is not the zip of a SAC",
+    "transfer A/model.zip T --out O --source-data x.npz": "--source-data: there is no file 'x.npz'",
+    "transfer A/model.zip T --out O --method rtpo": "choose one of zero-shot, rpo",
+    "transfer A/model.zip rpto/ContinuousCartPole-v0 --out O": "is the source itself",
+    "transfer A/model.zip Pendulum-v1 --out O": "--source ID",
+    "transfer A/model.zip rpto/InvertedDoublePendulum-target0-v0 --out O": "name its task's agent",
+    "transfer A/model.zip T --out O --set weigting=paper": "did you mean 'weighting'",
+    "transfer A/model.zip T --out O --set weighting=papre": "weighting='papre'",
+    "transfer A/model.zip T --out O --method sac-warm --set gama=1": "did you mean 'gamma'",
+    "transfer A/model.zip T --out O --method sysid-retrain": "--set 'declared=[...]'",
+    "plot absent.json --out f.png": "there is nothing at 'absent.json'",
+    "plot A/config.json --out f.png": "is no result file",
+    "plot A --out f.txt": "a figure is .png",
+    "enjoy absent.zip": "MODEL: there is no file 'absent.zip'",
+    "enjoy A/config.json T": "is no zip of a model",
+    "enjoy A/model.zip": "pass TARGET",
+    "enjoy A rpto/InvertedDoublePendulum-v0": "name the same task",
+    "enjoy A --episodes 0": "--episodes is 0",
+    "enjoy A --seconds 0": "--seconds is 0",
+    "enjoy A --video f.avi": "a film is .mp4 or .gif",
+    "enjoy A --video f.gif": "--source-model",
+}
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("command", BAD)
+def test_wrong_input_is_one_line_before_the_work(
+    command: str, agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = {"O": str(tmp_path / "out"), "T": TARGET}
+    given = [names.get(word, str(agent) + word[1:] if word.split("/")[0] == "A" else word) for word in command.split()]
+    assert cli.main(given) == 2
+    assert BAD[command] in error(capsys)
+    assert not (tmp_path / "out" / "model.zip").exists()
+
+
+def test_a_corrected_command_may_use_the_folder(agent: Path, tmp_path: Path) -> None:
+    assert transfer(agent, tmp_path, "rpto", "--set", "weighting=papre") == 2
+    assert transfer(agent, tmp_path, "rpto", "--set", "weighting=centred") == 0
+
+
+def test_numbers_in_settings_are_numbers(agent: Path, tmp_path: Path) -> None:
+    assert transfer(agent, tmp_path, "sac-warm", "--set", "learning_rate=1e-3") == 0
+    assert json.loads((tmp_path / "config.json").read_text())["settings"] == {"learning_rate": 0.001}
+
+
+def test_without_the_extras_the_remedy_is_named(
+    agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(video, "find_spec", lambda name: None)
+    assert cli.main(["enjoy", str(agent), "--video", "film.mp4", "--source-model", str(agent / "model.zip")]) == 2
+    assert "pip install 'sb3-rpto[video]'" in error(capsys)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert cli.main(["plot", str(agent), "--out", str(tmp_path / "figure.png")]) == 2
+    assert "pip install 'sb3-rpto[experiments]'" in error(capsys)
