@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from sb3_rpto.tracing.evidence import Evidence
 from sb3_rpto.tracing.identify import Fit, Problem
-from sb3_rpto.tracing.select import Evidence, Selection, Selector
+from sb3_rpto.tracing.select import Selection, Selector
 
 #: t* is this quantile of the largest t on complete data.
 LEVEL = 0.95

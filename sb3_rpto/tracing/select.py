@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
+from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit, Problem, bounded_step
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.windows import Windows
@@ -16,20 +17,18 @@ from sb3_rpto.tracing.windows import Windows
 #: t*, between the 3 and 4 that complete data usually give as the 95 % quantile of the largest t; `calibrate` measures
 #: it for the data at hand.
 THRESHOLD = 3.5
-#: Effects must lower the typical window error by this share to stay.
-GAIN = 0.03
-#: Typical window error, in units of the noise, above which it is the model's more than the noise's; t* and gain there.
-#: What else lacks, not the noise, then spreads the blocks, so a t beyond the 98 % quantile of one test is the best
-#: evidence there is; and of the many effects that would fit a little of what lacks, those that take a tenth are named.
-FAR, LIKELY, TENTH = 2.0, 2.0, 0.1
+#: Typical window error, in units of the noise, above which it is the model's more than the noise's.
+FAR = 2.0
+#: t* there: what else lacks, not the noise, spreads the blocks, and the 98 % quantile of one test is the best there is.
+LIKELY = 2.0
+#: Share of the error that counts there: of the many effects that would fit a little of what lacks, few are named.
+TENTH = 0.1
 #: Iterations of a refit that begins at the larger model's optimum.
 REFIT = 5
 #: Iterations of the joint fit of all candidates.
 JOINT = 15
 #: Effects whose removal raises the cost by less than this share, to second order, may go together.
 TRIFLE = 0.01
-#: Most folds of a cross-validation.
-FOLDS = 6
 #: t from which on an effect seems to matter.
 SEEMS = 1.5
 #: Rounds of the look forward, after a joint fit and in its place, and candidates fitted in each.
@@ -41,55 +40,7 @@ ENOUGH = 1.1
 #: Candidates for a substitution are the likest so many, of at least this cosine.
 SUBSTITUTES, LIKE = 5, 0.3
 
-#: Errors below this many units of noise are none: exact data are met to rounding, where any ratio may be large.
-NOTHING = 0.5
-
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What a model gains over another on the select windows.
-
-    :param gain: share of the typical window error saved, 1 - exp(-mean log ratio)
-    :param t: mean log error ratio of the blocks over its standard error
-    :param blocks: the log ratio of each block, (b,)
-    """
-
-    gain: float
-    t: float
-    blocks: np.ndarray
-
-    def clear(self, threshold: float, gain: float = GAIN) -> bool:
-        """Whether the gain is more than chance and more than a trifle."""
-        return self.t > threshold and self.gain > gain
-
-    def frequency(self, limit: tuple[float, float], rng: np.random.Generator, resamples: int = 200) -> float:
-        """Share of resampled sets of blocks in which the gain is clear by a limit of t and gain."""
-        n = len(self.blocks)
-        found = [_evidence(self.blocks[rng.integers(n, size=n)]).clear(*limit) for _ in range(resamples)]
-        return float(np.mean(found))
-
-
-def compare(without: np.ndarray, with_: np.ndarray, blocks: np.ndarray) -> Evidence:
-    """Evidence for the model with an effect against the one without.
-
-    :param without: errors of the windows, (W,)
-    :param with_: errors of the same windows, (W,)
-    :param blocks: number of the block of each window, (W,)
-    """
-    ratio = np.log(np.maximum(without, NOTHING)) - np.log(np.maximum(with_, NOTHING))
-    return _evidence(np.array([ratio[blocks == b].mean() for b in np.unique(blocks)]))
-
-
-def _evidence(blocks: np.ndarray) -> Evidence:
-    mean = float(blocks.mean())
-    if len(blocks) < 2:
-        return Evidence(1 - float(np.exp(-mean)), 0.0, blocks)
-    error = float(blocks.std(ddof=1)) / np.sqrt(len(blocks))
-    # Few blocks may agree by chance: their spread counts as at least a percent.
-    error = max(error, 0.01 / np.sqrt(len(blocks)))
-    return Evidence(1 - float(np.exp(-mean)), mean / error, blocks)
 
 
 @dataclass(frozen=True)
@@ -138,7 +89,7 @@ class Selector:
     ) -> None:
         self.train, self.select, self.threshold, self.say = train, select, threshold, say
         self.horizon = horizon
-        self.folds = folds(train.windows, FOLDS, horizon)
+        self.folds = folds(train.windows, horizon)
         self.blocks = np.concatenate([train.windows.block[b] for _, b in self.folds])
         if select:
             self.blocks = np.concatenate([self.blocks, select.windows.block + self.blocks.max() + 1])
@@ -460,26 +411,6 @@ class Selector:
             gains[e] = max(float(np.mean(np.log(base.errors) - np.log(fit.errors))), 1 - fit.cost / base.cost)
         best = sorted(outside, key=lambda e: -gains[e])[:PROMISING]
         return [e for e in best if gains[e] > GAIN]
-
-
-def folds(windows: Windows, count: int, horizon: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Part windows into folds by whole blocks: indices to fit and to judge on, with a window's gap between them.
-
-    :param windows: which may overlap
-    :param count: most folds
-    :param horizon: length of a window in s
-    """
-    names = np.unique(windows.block)
-    turn = np.searchsorted(names, windows.block) % min(count, len(names))
-    same = windows.episode[:, None] == windows.episode
-    beside = same & (np.abs(windows.time[:, None] - windows.time) < 2 * horizon - 1e-6)
-    parts = []
-    for k in range(turn.max() + 1):
-        chosen = turn == k
-        others = ~chosen & ~beside[:, chosen].any(axis=1)
-        # Where the gap leaves nothing, the data are too short for one.
-        parts.append((np.flatnonzero(others if others.any() else ~chosen), np.flatnonzero(chosen)))
-    return parts
 
 
 def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:

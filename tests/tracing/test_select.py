@@ -10,8 +10,9 @@ from simulated import compiled, problem, recorded
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, ViscousFriction
+from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.screen import screen
-from sb3_rpto.tracing.select import FAR, GAIN, LIKELY, TENTH, Evidence, Selection, Selector, compare, folds
+from sb3_rpto.tracing.select import FAR, LIKELY, TENTH, Selection, Selector
 from sb3_rpto.tracing.windows import cut
 
 THRESHOLD = 3.5
@@ -218,7 +219,7 @@ def test_folds_are_whole_blocks_and_a_gap_apart_from_what_is_fitted(overlap: flo
     horizon = 0.4
     data = recorded(episodes=2, duration=6.1)
     w = cut(compiled(), data, np.array([1e-3]), horizon, 100, overlap=overlap)
-    parts = folds(w, 4, horizon)
+    parts = folds(w, horizon, 4)
     assert len(parts) == 4
     np.testing.assert_array_equal(np.sort(np.concatenate([judged for _, judged in parts])), np.arange(len(w)))
     for others, judged in parts:
@@ -234,7 +235,7 @@ def test_few_blocks_are_as_many_folds_and_never_without_something_to_fit() -> No
     data = recorded(episodes=1, duration=2.6)
     w = cut(compiled(), data, np.array([1e-3]), 0.4, 100)
     count = len(np.unique(w.block))
-    parts = folds(w, 6, 0.4)
+    parts = folds(w, 0.4)
     assert len(parts) == count < 6
     assert all(len(others) and len(judged) for others, judged in parts)
     assert all(set(others) & set(judged) == set() for others, judged in parts)
