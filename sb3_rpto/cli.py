@@ -23,7 +23,12 @@ USER_ERRORS = (ValueError, TypeError, OSError, ImportError)
 #: Readers of recordings by the suffix of their files.
 FORMATS = {"csv": "from_csv", "parquet": "from_parquet", "npz": "from_npz"}
 #: Modules with ``main(arguments) -> exit code`` behind ``sb3-rpto benchmark NAME``.
-BENCHMARKS = {"speed": "sb3_rpto.experiments.speed", "tracing": "sb3_rpto.experiments.tracing_benchmark"}
+BENCHMARKS = {
+    "tracing": "sb3_rpto.experiments.tracing_benchmark",
+    "speed": "sb3_rpto.experiments.speed",
+    "transfer": "sb3_rpto.experiments.sweep",
+    "report": "sb3_rpto.experiments.tables",
+}
 
 Commands = Any  # argparse's own type for a group of subcommands is private
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, partial
@@ -16,17 +15,14 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch as th
-from stable_baselines3 import SAC
 
-from sb3_rpto.buffers import load_transitions
 from sb3_rpto.effects import LIBRARY, Declared, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.experiments import sources
 from sb3_rpto.experiments.report import iqm_interval
 from sb3_rpto.experiments.run import transfer
 from sb3_rpto.tracing.report import write_atomically
 
-#: Where trained source agents are looked for: ``<task>.zip`` and ``<task>_transitions.npz``.
-FOLDER_VARIABLE = "RPTO_SOURCES"
 SHIFTS = ("declared", "undeclared", "none")
 #: Two fixed targets for each task and shift.
 TARGETS = (0, 1)
@@ -149,23 +145,9 @@ def make_target(task: str, shift: str, target: int) -> gym.Env:
 
 @cache
 def source_agent(task: str, folder: Path) -> tuple[str, str | None]:
-    """The source's SAC and its transitions: found, or trained once and kept in ``folder``.
-
-    :return: paths; no transitions where the agent was found without them
-    """
+    """The source's SAC and its transitions; see :func:`sb3_rpto.experiments.sources.source_agent`."""
     made = TASKS[task]
-    given = Path(os.environ.get(FOLDER_VARIABLE, "../shared/sources"))
-    if (given / f"{made.env_id}.zip").exists():
-        data = given / f"{made.env_id}_transitions.npz"
-        return str(given / f"{made.env_id}.zip"), str(data) if data.exists() else None
-    path, data = folder / f"{made.env_id}.zip", folder / f"{made.env_id}_transitions.pkl"
-    if not path.exists():
-        model = SAC("MlpPolicy", make_source(task), seed=1_000, device="cpu")
-        model.learn(made.source_steps)
-        model.save_replay_buffer(data)
-        model.save(path)
-    load_transitions(data)
-    return str(path), str(data)
+    return sources.source_agent(made.env_id, partial(make_source, task), made.source_steps, folder)
 
 
 def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISODES) -> Path:

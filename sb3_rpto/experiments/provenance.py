@@ -1,0 +1,88 @@
+"""What made a result: versions, commit, machine, and every argument of the model."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import inspect
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from enum import Enum
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+
+PACKAGES = ("sb3-rpto", "torch", "stable-baselines3", "sb3-contrib", "gymnasium", "mujoco", "numpy", "scipy")
+#: What a constructor takes that says nothing of the method, and attributes that are not called as the argument is.
+_NOT_SETTINGS = frozenset({"self", "env", "target_env", "target_data", "_init_setup_model"})
+_ATTRIBUTES = {"policy": "policy_class", "dynamics": "dynamics_backend"}
+
+
+def versions() -> dict[str, str | None]:
+    """Of the packages that results depend on; None: it is not there."""
+    found: dict[str, str | None] = {}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def commit() -> str | None:
+    """The commit of the package's checkout, marked where it was changed; None outside of one."""
+    command = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
+    try:
+        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip() or None
+
+
+def machine() -> dict[str, str]:
+    """Python, system and cores."""
+    system = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    return {"python": platform.python_version(), "machine": system}
+
+
+def constructor_arguments(model: Any) -> dict[str, Any]:
+    """The values that an SB3 model has for the arguments of its own and its parents' constructors, as JSON takes them.
+
+    :param model: an algorithm; SB3's common base classes do not count
+    """
+    values: dict[str, Any] = {}
+    for cls in takewhile(lambda c: not c.__module__.startswith("stable_baselines3.common"), type(model).__mro__):
+        for parameter in inspect.signature(cls.__init__).parameters.values():  # type: ignore[misc]
+            name, kind = parameter.name, parameter.kind
+            if name in _NOT_SETTINGS or kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+                continue
+            attributes = (_ATTRIBUTES.get(name, name), name, f"_{name}")
+            found = [getattr(model, attribute) for attribute in attributes if hasattr(model, attribute)]
+            if found:
+                values.setdefault(name, plain(found[0]))
+    return values
+
+
+def plain(value: Any) -> Any:
+    """The same in types of strict JSON: no NaN, no infinity; classes and functions by their names."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, Enum):
+        return plain(value.value)
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    if isinstance(value, th.device):
+        return str(value)
+    named = value if hasattr(value, "__qualname__") else type(value)
+    return f"{named.__module__}.{named.__qualname__}"
