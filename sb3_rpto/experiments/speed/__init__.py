@@ -31,7 +31,7 @@ REQUIRED = {
     "100,000 rollouts": (15.0, None),
     "RPTO.learn()": (2.0, None),
 }
-ROUNDS = {"quick": 3, "full": 11}
+ROUNDS = {"quick": 3, "full": 7}
 
 Row = dict[str, Any]
 
@@ -91,7 +91,7 @@ def _cases(scale: str, device: str) -> list[Case]:
         cases.update(device, 20 if small else 100),
         cases.ensemble_training(device, 16),
         cases.rollouts(device, 10_000 if small else 100_000),
-        cases.whole_loop(device, 30 if small else 250, 50 if small else 500),
+        cases.whole_loop(device, 30 if small else 100, 50 if small else 200),
         cases.columns(50 if small else 400),
     ]
 
