@@ -53,9 +53,9 @@ def learning_curves(
                 band = (curve["steps"], curve["return_low"], curve["return_high"])
                 axis.fill_between(*band, alpha=0.18 if front else 0.07, linewidth=0, **style)
             known = references.get(f"{task}_{target}", {})
-            for name, dashes in (("oracle", "--"), ("zero_shot", ":")):
+            for name, words, dashes in (("oracle", "oracle", "--"), ("zero_shot", "source policy", ":")):
                 if name in known:
-                    axis.axhline(known[name], color="grey", linestyle=dashes, linewidth=1, label=name.replace("_", "-"))
+                    axis.axhline(known[name], color="grey", linestyle=dashes, linewidth=1, label=words)
             axis.set(title=f"{task}, {target}", xlabel="target steps", ylabel="return")
         for axis in row[len(targets[task]) :]:
             axis.set_visible(False)
