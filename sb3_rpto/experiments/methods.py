@@ -71,7 +71,8 @@ def _zero_shot(run: Run, curve: LearningCurve) -> None:
     curve.begin(baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, **run.kwargs))
 
 
-def _two_worlds(cls: type[TransferAlgorithm], run: Run, curve: LearningCurve) -> None:
+def two_worlds(cls: type[TransferAlgorithm], run: Run, curve: LearningCurve) -> None:
+    """Algorithms over a source and a target, warm-started from the source model."""
     source, kwargs = make_vec_env(run.make_source, n_envs=run.n_source_envs), dict(run.kwargs)
     if cls.updates_dynamics:
         kwargs["source_data"] = run.source_data
@@ -81,7 +82,7 @@ def _two_worlds(cls: type[TransferAlgorithm], run: Run, curve: LearningCurve) ->
 
 def _slbo(run: Run, curve: LearningCurve) -> None:
     stage = min(SLBO.NUMBERS["model_train_freq"], max(run.budget // 4, 1))
-    _two_worlds(SLBO, Run(**{**vars(run), "kwargs": {"model_train_freq": stage, **run.kwargs}}), curve)
+    two_worlds(SLBO, Run(**{**vars(run), "kwargs": {"model_train_freq": stage, **run.kwargs}}), curve)
 
 
 def _sac(run: Run, curve: LearningCurve) -> None:
@@ -160,18 +161,18 @@ def _number(updates: float) -> Callable[[str | None], float]:
 #: All methods, by the names of the command line.
 REGISTRY: dict[str, Method] = {
     "zero-shot": Method(_zero_shot, _number(0)),
-    "rpo": Method(partial(_two_worlds, RPO), _rpo_updates),
-    "rto": Method(partial(_two_worlds, RTO), _rpto_updates),
-    "rpto": Method(partial(_two_worlds, RPTO), _rpto_updates),
+    "rpo": Method(partial(two_worlds, RPO), _rpo_updates),
+    "rto": Method(partial(two_worlds, RTO), _rpto_updates),
+    "rpto": Method(partial(two_worlds, RPTO), _rpto_updates),
     "sac": Method(_sac, _number(1)),
     "sac-warm": Method(_sac_warm, _number(1)),
     "sac-warm-high": Method(_sac_warm_high, _rpto_updates),
     "sac-mixed": Method(_sac_mixed, _number(1)),
     "trpo-warm": Method(_trpo_warm, _number(1 / 2048), in_batches=True),
-    "mbpo": Method(partial(_two_worlds, MBPO), partial(_published, MBPO)),
+    "mbpo": Method(partial(two_worlds, MBPO), partial(_published, MBPO)),
     "slbo": Method(_slbo, _slbo_updates, in_batches=True),
-    "ptp": Method(partial(_two_worlds, PTP), partial(_published, PTP)),
-    "pdml": Method(partial(_two_worlds, PDML), partial(_published, PDML)),
+    "ptp": Method(partial(two_worlds, PTP), partial(_published, PTP)),
+    "pdml": Method(partial(two_worlds, PDML), partial(_published, PDML)),
     "sysid-retrain": Method(_sysid_retrain, _number(0), in_batches=True),
     "oracle": Method(_sac_warm, _number(1)),
 }

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch as th
 
 from sb3_rpto.dynamics.products import pays
+from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.speed import cases
 from sb3_rpto.experiments.speed.cases import Case, floor_of
 from sb3_rpto.experiments.speed.memory import peak_memory
@@ -139,9 +137,9 @@ def manifest(scale: str, threads: Sequence[int], device: str) -> Row:
     """What made the figures."""
     return {
         "command": f"{NAME} --scale {scale} --threads {' '.join(map(str, threads))} --device {device}",
-        "versions": {p: version(p) for p in ("sb3-rpto", "torch", "stable-baselines3", "mujoco", "numpy")},
-        "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "versions": provenance.versions(),
+        **provenance.machine(),
+        "commit": provenance.commit(),
         "gpu": th.cuda.get_device_name() if device.startswith("cuda") else "unmeasured",
         "oneDNN products chosen": pays(),
     }

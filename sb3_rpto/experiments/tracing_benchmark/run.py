@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import random
 import re
-import subprocess
 import sys
 import time
 import traceback
@@ -22,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from sb3_rpto.effects import Effect
+from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.tracing_benchmark.design import Case, design
 from sb3_rpto.experiments.tracing_benchmark.truth import Set, make
 from sb3_rpto.tracing import Measurements, Report, trace
@@ -83,16 +82,16 @@ def run(
     pending = [case for case in cases if not resume or stored(folder, case) is None]
     # In mixed order an unfinished run is a fair sample, and its time left an honest guess.
     random.Random(0).shuffle(pending)
-    commit, count = _commit(), min(workers or os.cpu_count() or 1, max(1, len(pending)))
+    made_by, count = provenance.commit(), min(workers or os.cpu_count() or 1, max(1, len(pending)))
     say = _Progress(len(pending))
     if count == 1:
         for case in pending:
-            say(work(case, folder, commit))
+            say(work(case, folder, made_by))
     else:
         with _environment(dict.fromkeys(_ONE_THREAD, "1")):
             pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"))
             try:
-                for done in as_completed([pool.submit(work, case, folder, commit) for case in pending]):
+                for done in as_completed([pool.submit(work, case, folder, made_by) for case in pending]):
                     say(done.result())
             finally:
                 pool.shutdown(cancel_futures=True)
@@ -117,7 +116,7 @@ def work(case: Case, folder: Path, commit: str | None) -> Result:
     except Exception:
         result["error"] = traceback.format_exc(limit=-3)
         result["seconds"] = time.process_time() - start
-    write_atomically(folder / f"{case.id}.json", json.dumps(_plain(result), indent=1, allow_nan=False) + "\n")
+    write_atomically(folder / f"{case.id}.json", json.dumps(provenance.plain(result), indent=1, allow_nan=False) + "\n")
     return result
 
 
@@ -184,25 +183,6 @@ def _at_horizon(errors: Sequence[HorizonError]) -> dict[str, float] | None:
         if e.horizon == HORIZON:
             return dict(zip(e.joints, map(float, e.rmse)))
     return None
-
-
-def _plain(value: Any) -> Any:
-    """The same without NaN and infinity, which JSON does not know."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _commit() -> str | None:
-    """The commit of the package's checkout, marked where it was changed; None outside of one."""
-    command = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
-    try:
-        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return done.stdout.strip() or None
 
 
 @contextmanager

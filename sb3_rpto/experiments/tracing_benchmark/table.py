@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import csv
-import importlib.metadata
 import io
 import json
 import os
-import platform
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.planting import SYSTEMS
 from sb3_rpto.experiments.tracing_benchmark.design import GROUPS, HIGH, LOW, Case, fingerprint
 from sb3_rpto.experiments.tracing_benchmark.score import APPLY, MEASURES, Result, Row, Share, score, share
@@ -30,7 +29,6 @@ REQUIRED: tuple[tuple[str, str, str, float | None, float], ...] = (
     ("outside the library: never called explained", "outside", "not explained", None, 1.0),
 )
 """What must hold: words, group, measure, noise (None: any), least share."""
-_PACKAGES = ("sb3-rpto", "mujoco", "numpy", "scipy", "gymnasium")
 _BY: dict[str, Callable[[Row], str]] = {
     "all": lambda row: "",
     "noise": lambda row: f"{1e3 * row.case['noise']:g} mrad",
@@ -183,12 +181,6 @@ def summary_csv(rows: Sequence[Row]) -> str:
 
 def manifest(results: Sequence[Result], cases: Sequence[Case], command: str) -> dict[str, Any]:
     """What made the table: command, versions, commits, the design's hash, seconds."""
-    versions: dict[str, str | None] = {}
-    for name in _PACKAGES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = None
     return {
         "command": command,
         "design": fingerprint(cases),
@@ -197,9 +189,8 @@ def manifest(results: Sequence[Result], cases: Sequence[Case], command: str) -> 
         "errors": sum(result["error"] is not None for result in results),
         "commits": sorted({str(result["commit"]) for result in results}),
         "traced_with": sorted({result["version"] for result in results}),
-        "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-        "versions": versions,
+        **provenance.machine(),
+        "versions": provenance.versions(),
         "seconds": round(sum(result["seconds"] for result in results), 1),
     }
 
