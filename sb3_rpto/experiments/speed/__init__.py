@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ REQUIRED = {
     "100,000 rollouts": (15.0, None),
     "RPTO.learn()": (2.0, None),
 }
-ROUNDS = {"quick": 3, "full": 7}
+ROUNDS = {"quick": 3, "full": 5}
 
 Row = dict[str, Any]
 
@@ -63,23 +63,28 @@ def run_benchmark(out: str, scale: str, threads: Sequence[int], device: str) -> 
     :param device: of the networks
     :return: exit code, 0: a missed number is a result
     """
+    Path(out).mkdir(parents=True, exist_ok=True)
     before = th.get_num_threads()
-    rows: list[Row] = []
+    found: dict[str, Any] = {"manifest": manifest(scale, threads, device), "cases": [], "growth": []}
+
+    def keep(part: str, row: Row) -> None:
+        found[part].append(row)
+        write_atomically(Path(out) / "speed.json", json.dumps(found, indent=1) + "\n")
+        write_atomically(Path(out) / "speed.md", table(found["cases"], found["growth"]))
+
     try:
         for count in threads:
             th.set_num_threads(count)
             for case in _cases(scale, device):
-                rows.append({"threads": count, **measure(case, ROUNDS[scale], device)})
-                print(line(rows[-1]), file=sys.stderr, flush=True)
+                row = {"threads": count, **measure(case, ROUNDS[scale], device)}
+                print(line(row), file=sys.stderr, flush=True)
+                keep("cases", row)
         th.set_num_threads(min(threads))
-        grown = growth(scale, device)
+        for row in growth(scale, device):
+            keep("growth", row)
     finally:
         th.set_num_threads(before)
-    found = {"manifest": manifest(scale, threads, device), "cases": rows, "growth": grown}
-    write_atomically(Path(out) / "speed.json", json.dumps(found, indent=1) + "\n")
-    text = table(rows, grown)
-    write_atomically(Path(out) / "speed.md", text)
-    print(text)
+    print(table(found["cases"], found["growth"]))
     return 0
 
 
@@ -116,21 +121,19 @@ def measure(case: Case, rounds: int, device: str = "cpu") -> Row:
     return row
 
 
-def growth(scale: str, device: str) -> list[Row]:
+def growth(scale: str, device: str) -> Iterator[Row]:
     """How update and memory grow with observation, batch, replay, and the ensemble's training with its members."""
     small = scale == "quick"
     rounds, count = (1, 5) if small else (5, 20)
-    rows: list[Row] = []
     for what, values in (("observation", (17, 111, 376)), ("batch", (64, 256, 1_024)), ("rows", (10_000, 200_000))):
         for value in values[:2] if small else values:
             found = measure(cases.update(device, count, **{what: value}), rounds, device)
-            rows.append({"what": f"update, {what}", "value": value, **found})
+            yield {"what": f"update, {what}", "value": value, **found}
     for members in (3, 7) if small else (3, 7, 15):
         found = measure(cases.ensemble_training(device, 16, members), rounds, device)
-        rows.append({"what": "ensemble, members", "value": members, **found})
+        yield {"what": "ensemble, members", "value": members, **found}
     for size in (10_000,) if small else (10_000, 100_000, 400_000):
-        rows.append({"what": "peak memory, rows in each buffer", "value": size, "megabytes": peak_memory(size, 17)})
-    return rows
+        yield {"what": "peak memory, rows in each buffer", "value": size, "megabytes": peak_memory(size, 17)}
 
 
 def manifest(scale: str, threads: Sequence[int], device: str) -> Row:
