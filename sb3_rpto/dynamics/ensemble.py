@@ -183,18 +183,6 @@ class EnsembleDynamics(Dynamics):
         prediction = self.step(data.observations, data.actions, deterministic=True)
         return relative_error(prediction.next_observations, data)
 
-    @th.no_grad()
-    def disagreement(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """How far the elites differ on each next observation.
-
-        :param observations: (n, observation_dim)
-        :param actions: (n, action_dim)
-        :return: (n,), the elites' standard deviation in units of the scaler's standard change (root mean square over
-            the dimensions); 0 with one elite
-        """
-        means = self._ask_elites(self._inputs(observations, actions)).mean[..., :-1]
-        return means.var(dim=0, unbiased=False).mean(dim=-1).sqrt()
-
     # ---------------------------------------------------------------------- fit
 
     def fit(

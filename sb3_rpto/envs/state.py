@@ -8,7 +8,6 @@ from __future__ import annotations
 import copy
 import inspect
 import pickle
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -283,43 +282,3 @@ def accepts_seed(env: gym.Env) -> bool:
         if named and not type(layer).reset.__module__.startswith(_FORWARDING):
             return True
     return True
-
-
-def replay_differs(
-    source_copy: gym.Env,
-    seed: int | None,
-    first_obs: np.ndarray,
-    actions: Sequence[np.ndarray],
-    next_obs_list: Sequence[np.ndarray],
-) -> bool | None:
-    """Whether the source, started as the target was, answers the same actions differently.
-
-    Observations count as equal up to float32 rounding (1e-6 relative).
-
-    :param source_copy: what :func:`copy_env` returned; it is reset and stepped
-    :param seed: the seed of the target's reset
-    :param first_obs: (observation_dim,), what the target's reset returned
-    :param actions: the first actions of that episode, as the target received them
-    :param next_obs_list: the target's answer to each
-    :return: None when nothing can be said: no seed, no actions, or the first observations differ
-    """
-    if seed is None or not len(actions):
-        return None
-    observation, _ = source_copy.reset(seed=seed)
-    if not _same(observation, first_obs):
-        return None
-    last = len(actions) - 1
-    for index, (action, expected) in enumerate(zip(actions, next_obs_list)):
-        observation, _, terminated, truncated, _ = source_copy.step(action)
-        if not _same(observation, expected):
-            return True
-        if terminated and index < last:  # the target went on
-            return True
-        if truncated:
-            break
-    return False
-
-
-def _same(one: np.ndarray, other: np.ndarray) -> bool:
-    one, other = np.asarray(one, np.float64), np.asarray(other, np.float64)
-    return one.shape == other.shape and np.allclose(one, other, rtol=1e-6, atol=1e-7, equal_nan=True)

@@ -518,21 +518,6 @@ def test_termination_is_learned_and_says_so_once():
         make(termination_fn=never)
 
 
-def test_disagreement():
-    model, data = make(min_holdout_for_elites=10_000), linear(1000)
-    model.fit(data, max_steps=300)
-    near = model.disagreement(data.observations, data.actions)
-    far = model.disagreement(5 * data.observations, data.actions)
-    assert near.shape == (1000,)
-    assert far.mean() > 3 * near.mean()
-    means = (
-        np.stack([members_alone(model, data)[m]["mean"][:, :OBS] for m in range(3)]) / model.target_std[:OBS].numpy()
-    )
-    expected = np.sqrt(((means - means.mean(axis=0)) ** 2).mean(axis=(0, 2)))
-    np.testing.assert_allclose(near, expected, rtol=1e-3, atol=1e-5)
-    assert not make(n_elites=1).disagreement(data.observations, data.actions).any()
-
-
 # ----------------------------------------------------------------- checkpoint
 
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecCheckNan, VecMonitor, VecNormalize
 
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
-from sb3_rpto.envs.state import accepts_seed, copy_env, replay_differs, restore_state, save_state
+from sb3_rpto.envs.state import accepts_seed, copy_env, restore_state, save_state
 
 MUJOCO = [
     *("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "InvertedDoublePendulum-v5", "InvertedPendulum-v5", "Pusher-v5"),
@@ -310,30 +310,3 @@ def test_whether_reset_takes_a_seed():
     assert not accepts_seed(OldReset())
     assert not accepts_seed(Monitor(Keywords(OldReset())))
     assert not accepts_seed(wrappers.TimeLimit(OldReset(), 5))
-
-
-def episode(env, seed, steps=20):
-    first, _ = env.reset(seed=seed)
-    rng = np.random.default_rng(0)
-    actions = [rng.uniform(-2, 2, 1).astype(np.float32) for _ in range(steps)]
-    return first, actions, [env.step(action)[0] for action in actions]
-
-
-def test_replay_tells_a_shifted_target_from_an_equal_one():
-    source = copy_env(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
-    same = episode(gym.make("Pendulum-v1"), seed=4)
-    assert replay_differs(source, 4, *same) is False
-    assert replay_differs(source, 4, *episode(gym.make("Pendulum-v1", g=9.9), seed=4)) is True
-    assert replay_differs(source, 5, *same) is None  # another start: nothing to compare
-    assert replay_differs(source, None, *same) is None
-    assert replay_differs(source, 4, same[0], [], []) is None
-
-
-def test_replay_sees_a_source_that_ends_earlier():
-    def pole(threshold):
-        return ContinuousCartPoleEnv(theta_threshold=threshold)
-
-    source = copy_env(DummyVecEnv([lambda: pole(0.1)]))
-    assert replay_differs(source, 0, *episode(pole(3.0), 0, steps=60)) is True
-    limited = copy_env(DummyVecEnv([lambda: wrappers.TimeLimit(pole(3.0), 10)]))
-    assert replay_differs(limited, 0, *episode(pole(3.0), 0, steps=30)) is False
