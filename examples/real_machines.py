@@ -3,7 +3,7 @@
 python examples/real_machines.py --out runs/machines
 
 The recordings are not part of the project: docs/real-machines.md says where they come from. Each machine's parameters
-and effects are chosen on its training runs alone; the test runs and the other distribution are looked at once.
+and effects are chosen on its training runs alone; the test runs and the other distribution only judge them.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def rows(name: str, data: str, model: str, errors: list[HorizonError]) -> list[d
 def study(machine: Machine, out: Path, seed: int) -> tuple[list[dict[str, object]], dict[str, object]]:
     """Trace one machine: error rows and what was found."""
     began = time.perf_counter()
-    report = trace(machine.xml, machine.data, machine.declared, seed=seed, horizon=machine.horizon)
+    report = trace(machine.xml, machine.data, machine.declared, seed=seed)
     seconds = time.perf_counter() - began
     report.save(out / machine.name)
     print(f"\n===== {machine.name}, {seconds:.0f} s\n{report}")

@@ -42,7 +42,6 @@ class Machine:
     :param other: recordings from another distribution, None where there are none
     :param licence: SPDX name of the recordings' licence
     :param source: where the recordings come from
-    :param horizon: of the windows, as :func:`~sb3_rpto.tracing.trace` takes it
     """
 
     name: str
@@ -52,7 +51,6 @@ class Machine:
     other: Measurements | None
     licence: str
     source: str
-    horizon: float | None = None
 
 
 def find_measured() -> Path | None:
@@ -148,8 +146,6 @@ def servo_xl330(folder: str | os.PathLike[str]) -> Machine:
         other=None,
         licence="Apache-2.0",
         source="github.com/Rhoban/bam, commit af226042",
-        # The controller keeps errors from growing, and half a second does not show where the arm comes to rest.
-        horizon=2.0,
     )
 
 

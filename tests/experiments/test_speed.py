@@ -126,11 +126,13 @@ def test_a_case_becomes_a_row_and_a_line_of_the_table(monkeypatch):
 
 def test_the_command_writes_figures_and_manifest(tmp_path, monkeypatch):
     monkeypatch.setattr(speed, "_cases", lambda *_: [cases.columns(2)])
-    monkeypatch.setattr(speed, "growth", lambda *_: [{"what": "peak memory", "value": 10, "megabytes": 5.0}])
+    monkeypatch.setattr(
+        speed, "growth", lambda *_: [{"what": "peak memory", "value": 10, "megabytes": {"SB3": 5, "ours": 6}}]
+    )
     before = th.get_num_threads()
     assert speed.main(["--out", str(tmp_path / "new"), "--threads", "1"]) == 0
     assert th.get_num_threads() == before
     found = json.loads((tmp_path / "new" / "speed.json").read_text())
     assert found["cases"][0]["case"] == "columns of the fit"
     assert found["manifest"]["gpu"] == "unmeasured"
-    assert "| peak memory | 10 |" in (tmp_path / "new" / "speed.md").read_text()
+    assert "| peak memory | 10 | 5 MB | 6 MB |" in (tmp_path / "new" / "speed.md").read_text()

@@ -15,7 +15,7 @@ from sb3_rpto.dynamics.products import pays
 from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.speed import cases
 from sb3_rpto.experiments.speed.cases import Case, floor_of
-from sb3_rpto.experiments.speed.memory import peak_memory
+from sb3_rpto.experiments.speed.memory import MAKERS, peak_memory
 from sb3_rpto.experiments.speed.timing import flops, interleaved
 from sb3_rpto.tracing.report import write_atomically
 
@@ -133,7 +133,8 @@ def growth(scale: str, device: str) -> Iterator[Row]:
         found = measure(cases.ensemble_training(device, 16, members), rounds, device)
         yield {"what": "ensemble, members", "value": members, **found}
     for size in (10_000,) if small else (10_000, 100_000, 400_000):
-        yield {"what": "peak memory, rows in each buffer", "value": size, "megabytes": peak_memory(size, 17)}
+        megabytes = {whose: round(peak_memory(whose, size, 17)) for whose in MAKERS}
+        yield {"what": "peak memory, rows in the buffer", "value": size, "megabytes": megabytes}
 
 
 def manifest(scale: str, threads: Sequence[int], device: str) -> Row:
@@ -172,12 +173,13 @@ def table(rows: Sequence[Row], grown: Sequence[Row]) -> str:
             f"| {row['threads']} | {row['case']} | {row['against']}: {ms[row['against']]:.3g} {row['unit']} | "
             f"{ms['ours']:.3g} | {row['ratio']:.2f} [{low:.2f}, {high:.2f}] | {share} | {required} | {met} |"
         )
-    text += ["", "| growth with | value | plain ms | ours ms | ratio |", "|---|---|---|---|---|"]
+    text += ["", "| growth with | value | plain | ours | ratio |", "|---|---|---|---|---|"]
     for row in grown:
         if "megabytes" in row:
-            text.append(f"| {row['what']} | {row['value']:,} | – | {row['megabytes']:.0f} MB | – |")
+            plain, ours = (row["megabytes"][whose] for whose in MAKERS)
+            text.append(f"| {row['what']} | {row['value']:,} | {plain:,} MB | {ours:,} MB | – |")
         else:
             ms = row["milliseconds"]
-            cells = f"{ms[row['against']]:.3g} | {ms['ours']:.3g} | {row['ratio']:.2f}"
+            cells = f"{ms[row['against']]:.3g} ms | {ms['ours']:.3g} ms | {row['ratio']:.2f}"
             text.append(f"| {row['what']} | {row['value']:,} | {cells} |")
     return "\n".join(text) + "\n"

@@ -90,21 +90,35 @@ def random_rows(n: int, observation: int, action: int, seed: int = 0) -> dict[st
 
 def update(device: str, count: int, observation: int = OBSERVATION, batch: int = BATCH, rows: int = 20_000) -> Case:
     """SAC's update against SB3's own."""
-    stage = Stage(observation)
-    sac = SAC("MlpPolicy", stage, seed=0, device=device, buffer_size=rows, batch_size=batch)
-    rpo = RPO("MlpPolicy", stage, target_env=Stage(observation), seed=0, device=device, buffer_size=rows)
-    data, memory = random_rows(rows, observation, ACTION), sac.replay_buffer
+    sac, rpo = (make(device, observation, batch, rows) for make in (sac_with_data, rpo_with_data))
+    variants = {"SB3": partial(sac.train, count, batch), "ours": partial(rpo.train, count, batch)}
+    return Case("SAC update", "ms/update", count, variants, "ours", "SB3", sac_products(observation, batch, count))
+
+
+def sac_with_data(device: str, observation: int, batch: int, rows: int) -> SAC:
+    """SB3's, with a full replay buffer."""
+    sac = SAC("MlpPolicy", Stage(observation), seed=0, device=device, buffer_size=rows, batch_size=batch)
+    memory = sac.replay_buffer
     assert memory is not None
-    for name, values in data.items():
+    for name, values in random_rows(rows, observation, ACTION).items():
         getattr(memory, name)[:, 0] = values
     memory.full = True
-    rpo.replay_buffer.append("source", **data)
+    return _ready(sac)
+
+
+def rpo_with_data(device: str, observation: int, batch: int, rows: int) -> RPO:
+    """Ours, with a full source side and at most 5,000 transitions of the target."""
+    target = Stage(observation)
+    rpo = RPO("MlpPolicy", Stage(observation), target_env=target, seed=0, device=device, buffer_size=rows)
+    rpo.replay_buffer.append("source", **random_rows(rows, observation, ACTION))
     rpo.replay_buffer.append("target", **random_rows(min(rows, 5_000), observation, ACTION, 1))
-    for model in (sac, rpo):
-        model.set_logger(configure(None, []))
-        model._current_progress_remaining = 1.0
-    variants = {"SB3": lambda: sac.train(count, batch), "ours": lambda: rpo.train(count, batch)}
-    return Case("SAC update", "ms/update", count, variants, "ours", "SB3", sac_products(observation, batch, count))
+    return _ready(rpo)
+
+
+def _ready(model: Any) -> Any:
+    model.set_logger(configure(None, []))
+    model._current_progress_remaining = 1.0
+    return model
 
 
 def sac_products(observation: int, batch: int, updates: int) -> Shapes:
