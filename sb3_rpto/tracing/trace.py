@@ -203,7 +203,7 @@ def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
 def search(selector: Selector, rough: Selector, base: Model, screening: Screening, say: Progress) -> Selection:
     """Joint fit of all excited candidates, elimination backwards, a last look forward, substitution by like ones.
 
-    Where the joint fit ends far from the noise, effects are added one by one instead.
+    Where the joint fit ends far from the noise and no nearer than it began, effects are added one by one instead.
 
     :param selector: integrates finely, for what is decided in the end
     :param rough: integrates as the model does, for the elimination: it costs most
@@ -213,7 +213,7 @@ def search(selector: Selector, rough: Selector, base: Model, screening: Screenin
     say(0.2, f"fitting {len(chosen)} candidates together")
     alone = rough.model((), base.fit)
     joint = rough.together(chosen, alone.fit)
-    if rough.far(joint):  # it is stuck, or more lacks than they can give: no place to begin
+    if rough.far(joint) and not rough.evidence(joint, alone).clear(SEEMS):  # no place to begin
         selection = rough.look_forward(Selection(alone), chosen, INSTEAD)
     else:
         # What seems to matter stays while much else may still be wrong.
