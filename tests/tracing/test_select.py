@@ -11,8 +11,10 @@ from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, ViscousFriction
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
+from sb3_rpto.tracing.identify import Fit
 from sb3_rpto.tracing.screen import screen
-from sb3_rpto.tracing.select import FAR, LIKELY, TENTH, Selection, Selector
+from sb3_rpto.tracing.select import FAR, INSTEAD, LIKELY, ROUNDS, TENTH, Model, Selection, Selector
+from sb3_rpto.tracing.trace import search
 from sb3_rpto.tracing.windows import cut
 
 THRESHOLD = 3.5
@@ -146,6 +148,27 @@ def test_near_the_noise_evidence_must_be_clearer_far_from_it_the_gain_larger() -
     far = s.model((), kept.model.fit)
     assert np.median(far.errors) > FAR
     assert s.limit(far) == (LIKELY, TENTH)
+
+
+@pytest.mark.parametrize("stuck", [True, False])
+def test_a_joint_fit_that_is_no_better_than_none_gives_way_to_effects_one_by_one(stuck: bool) -> None:
+    s = selector([CoulombFriction("hinge", level=0.08)])
+    base = s.model((), s.train.score(s.train.null))
+    forward: list[int] = []
+    look, together = s.look_forward, s.together
+
+    def looking(selection: Selection, candidates: list[int], rounds: int = ROUNDS) -> Selection:
+        forward.append(rounds)
+        return look(selection, candidates, rounds)
+
+    def ending_badly(effects: list[int], fit: Fit) -> Model:
+        joint = together(effects, fit)
+        return replace(joint, errors=2 * base.errors) if stuck else joint
+
+    s.look_forward, s.together = looking, ending_badly  # type: ignore[method-assign, assignment]
+    selection = search(s, s, base, screen(s.train, base.fit), lambda share, what: None)
+    assert selection.model.effects == (COULOMB,)
+    assert forward == [INSTEAD if stuck else ROUNDS]
 
 
 def test_looking_forward_brings_a_wrongly_dropped_effect_back() -> None:
