@@ -28,7 +28,8 @@ class Descent:
     def __call__(self, loss: th.Tensor) -> None:
         """One step down the gradient of ``loss``."""
         gradients = th.autograd.grad(loss, self.parameters, allow_unused=True)
-        if self._plain and self.optimizer.state and all(gradient is not None for gradient in gradients):
+        begun = len(self.optimizer.state) == len(self.parameters)  # the first step makes the state
+        if self._plain and begun and all(gradient is not None for gradient in gradients):
             self._step_adam(list(gradients))
             return
         for parameter, gradient in zip(self.parameters, gradients):

@@ -24,7 +24,8 @@ def sample_actions(actor: Actor, observations: th.Tensor) -> tuple[th.Tensor, th
     :return: actions in [-1, 1], (n, action_dim), and log pi(a|s), (n, 1)
     """
     distribution = actor.action_dist
-    if type(distribution) is not SquashedDiagGaussianDistribution:  # gSDE
+    own = type(actor).action_log_prob is not Actor.action_log_prob
+    if own or type(distribution) is not SquashedDiagGaussianDistribution:  # the user's way, gSDE
         actions, log_prob = actor.action_log_prob(observations)
         return actions, log_prob.reshape(-1, 1)
     mean, log_std, _ = actor.get_action_dist_params(observations)

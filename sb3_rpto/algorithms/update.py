@@ -24,8 +24,8 @@ from sb3_rpto.dynamics.weights import WeightingName, effective_sample_size, rto_
 
 #: The actor's batches alternate: four from D_target, then one from D_source (f = 5 in the paper's appendix).
 ALTERNATION = 5
-#: Updates whose batches are gathered at once.
-BURST = 64
+#: Rows that are gathered at once, of several updates.
+GATHERED = 16_384
 
 
 class Descents(NamedTuple):
@@ -85,8 +85,9 @@ class RelativeUpdate(SAC):
         follow = Follower(self.critic_target, self.critic, self.tau)
         losses: dict[str, list[th.Tensor]] = {}
         with fast_products(self.device):
-            for first in range(0, gradient_steps, BURST):
-                batches = self.sample_batches(min(BURST, gradient_steps - first), batch_size)
+            burst = max(1, GATHERED // batch_size)
+            for first in range(0, gradient_steps, burst):
+                batches = self.sample_batches(min(burst, gradient_steps - first), batch_size)
                 for step, (critic_batch, actor_batch) in enumerate(batches, first):
                     for name, loss in self.update_once(critic_batch, actor_batch, descents).items():
                         losses.setdefault(name, []).append(loss.detach().reshape(()))

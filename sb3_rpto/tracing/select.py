@@ -219,7 +219,7 @@ class Selector:
                 trial = self.model([e for e in current.effects if e not in drop], current.fit)
                 evidence = self.evidence(current, trial)
                 self.say(f"{len(trial.effects)} effects left")
-                if not evidence.clear(*(self.limit(current) if limit is None else (limit,))):
+                if not evidence.clear(*(self.limit(current) if limit is None else (limit, GAIN))):
                     reduced = trial
                     for e in drop:
                         outcome.dropped[e] = (step, evidence)
@@ -356,7 +356,7 @@ class Selector:
 
     def _better(self, a: Model, b: Model) -> bool:
         """Whether one of two likes does better: near the noise that seems so soon, far from it it must be clear."""
-        return self.evidence(a, b).clear(*(self.limit(a) if self.far(a) else (SEEMS,)))
+        return self.evidence(a, b).clear(*(self.limit(a) if self.far(a) else (SEEMS, GAIN)))
 
     def _simpler(self, a: int, b: int) -> bool:
         return len(self.simulation.effects[a].parameters) < len(self.simulation.effects[b].parameters)

@@ -8,9 +8,12 @@ import torch as th
 from conftest import ALGORITHMS, pendulum, small
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import configure
+from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms.update import ALTERNATION
+from sb3_rpto.algorithms.descent import Descent
+from sb3_rpto.algorithms.forward import sample_actions
+from sb3_rpto.algorithms.update import ALTERNATION, GATHERED
 
 
 def filled_sac(**kwargs) -> SAC:
@@ -122,3 +125,44 @@ def test_values_for_the_weights_are_the_target_critics():
     th.testing.assert_close(
         model.q_value(observations, 2 * actions), th.minimum(*model.critic_target(observations, actions))[:, 0]
     )
+
+
+def test_a_policy_that_draws_its_actions_itself_is_asked():
+    class Own(Actor):
+        def action_log_prob(self, obs):
+            return th.full((len(obs), 1), 0.25), th.full((len(obs),), -3.0)
+
+    class OwnPolicy(SACPolicy):
+        def make_actor(self, features_extractor=None):
+            kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+            return Own(**kwargs).to(self.device)
+
+    model = small(RPTO)
+    own = OwnPolicy(model.observation_space, model.action_space, lambda _: 1e-3).actor
+    actions, log_prob = sample_actions(own, th.zeros(5, 3))
+    assert (actions == 0.25).all()
+    assert actions.shape == (5, 1)
+    assert (log_prob == -3.0).all()
+    assert log_prob.shape == (5, 1)
+
+
+def test_what_does_not_fit_is_gathered_in_parts(monkeypatch):
+    model = small(RPO)
+    model.learn(64, source_timesteps=0)
+    counts, batches = [], model.sample_batches
+    monkeypatch.setattr(model, "sample_batches", lambda count, size: (counts.append(count), batches(count, size))[1])
+    model.train(5, GATHERED // 2)
+    assert counts == [2, 2, 1]
+
+
+def test_adam_with_options_of_the_users_steps_as_it_is():
+    weights = [th.nn.Parameter(th.tensor([1.0, -2.0])) for _ in range(2)]
+    theirs, ours = (th.optim.Adam([w], lr=0.1, amsgrad=True) for w in weights)
+    descend = Descent(ours)
+    for step in range(5):
+        theirs.zero_grad()
+        ((step - 2) * weights[0].square()).sum().backward()
+        theirs.step()
+        descend(((step - 2) * weights[1].square()).sum())
+    assert th.equal(weights[0], weights[1])
+    assert th.equal(theirs.state[weights[0]]["max_exp_avg_sq"], ours.state[weights[1]]["max_exp_avg_sq"])

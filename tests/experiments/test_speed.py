@@ -116,7 +116,7 @@ def test_ratios_are_formed_round_by_round():
 def test_a_case_becomes_a_row_and_a_line_of_the_table(monkeypatch):
     seconds = {"plain": np.array([4.0, 4.0]), "ours": np.array([1.0, 2.0]), "floor": np.array([0.5, 0.5])}
     monkeypatch.setattr(speed, "interleaved", lambda *_: timing.Times(seconds))
-    case = Case("SAC update", "ms/update", 10, {"plain": print, "ours": print}, "ours", "plain", {(1, 2, 2, 2): 1})
+    case = Case("SAC update", "ms/update", 10, {"plain": print, "ours": print}, "plain", {(1, 2, 2, 2): 1})
     row = {"threads": 1, **speed.measure(case, 2)}
     assert row["milliseconds"] == {"plain": 400, "ours": 150, "floor": 50}
     assert (row["ratio"], row["range"], row["floor_share"]) == (3, [2, 4], 0.375)

@@ -14,9 +14,9 @@ import torch as th
 from sb3_rpto.dynamics.products import pays
 from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.speed import cases
-from sb3_rpto.experiments.speed.cases import Case, floor_of
+from sb3_rpto.experiments.speed.cases import Case
 from sb3_rpto.experiments.speed.memory import MAKERS, peak_memory
-from sb3_rpto.experiments.speed.timing import flops, interleaved
+from sb3_rpto.experiments.speed.timing import flops, interleaved, products
 from sb3_rpto.tracing.report import write_atomically
 
 __all__ = ["add_arguments", "main", "run_benchmark"]
@@ -103,9 +103,9 @@ def measure(case: Case, rounds: int, device: str = "cpu") -> Row:
     """Time a case: milliseconds a unit of each variant, the ratio, and the share of the floor that ours reaches."""
     variants = dict(case.variants)
     if case.floor:
-        variants["floor"] = floor_of(case, device)
+        variants["floor"] = products(case.floor, device)
     times = interleaved(variants, rounds, device)
-    ratio, low, high = times.ratio(case.plain, case.ours)
+    ratio, low, high = times.ratio(case.plain, "ours")
     row: Row = {
         "case": case.name,
         "unit": case.unit,
@@ -115,7 +115,7 @@ def measure(case: Case, rounds: int, device: str = "cpu") -> Row:
         "range": [round(low, 3), round(high, 3)],
     }
     if case.floor:
-        share, low, high = times.ratio("floor", case.ours)
+        share, low, high = times.ratio("floor", "ours")
         row |= {"floor_share": round(share, 3), "floor_range": [round(low, 3), round(high, 3)]}
         row["gflops"] = round(1e-9 * flops(case.floor) / times.median("floor"), 1)
     return row

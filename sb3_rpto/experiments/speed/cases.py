@@ -25,7 +25,7 @@ from sb3_rpto.dynamics.products import fast_products
 from sb3_rpto.effects import Simulation, declare
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.experiments.speed.plain import PlainEnsemble, PlainRPTO
-from sb3_rpto.experiments.speed.timing import Variants, products
+from sb3_rpto.experiments.speed.timing import Variants
 
 #: Observation and action dimensions of HalfCheetah, SAC's batch and hidden layers, the ensemble's hidden layers.
 OBSERVATION, ACTION, BATCH, HIDDEN, WIDE = 17, 6, 256, (256, 256), (400, 400, 400, 400)
@@ -41,9 +41,8 @@ class Case:
     :param name: what is timed
     :param unit: of the reported milliseconds
     :param count: units in one run of a variant
-    :param variants: what takes turns
-    :param ours: the fast one
-    :param plain: the one it is measured against
+    :param variants: what takes turns, the fast one by the name "ours"
+    :param plain: the one that "ours" is measured against
     :param floor: matrix products that it cannot do without; empty where they are not the cost
     """
 
@@ -51,7 +50,6 @@ class Case:
     unit: str
     count: int
     variants: Variants
-    ours: str
     plain: str
     floor: Shapes = field(default_factory=Counter)
 
@@ -92,7 +90,7 @@ def update(device: str, count: int, observation: int = OBSERVATION, batch: int =
     """SAC's update against SB3's own."""
     sac, rpo = (make(device, observation, batch, rows) for make in (sac_with_data, rpo_with_data))
     variants = {"SB3": partial(sac.train, count, batch), "ours": partial(rpo.train, count, batch)}
-    return Case("SAC update", "ms/update", count, variants, "ours", "SB3", sac_products(observation, batch, count))
+    return Case("SAC update", "ms/update", count, variants, "SB3", sac_products(observation, batch, count))
 
 
 def sac_with_data(device: str, observation: int, batch: int, rows: int) -> SAC:
@@ -150,7 +148,7 @@ def ensemble_training(device: str, steps: int, members: int = 7, rows: int = 5_0
     sizes = [OBSERVATION + ACTION, *WIDE, 2 * (OBSERVATION + 1)]
     _forward(shapes, sizes, BATCH, steps, members)
     _backward(shapes, sizes, BATCH, steps, weights=True, inputs=False, n=members)
-    return Case("ensemble training", "ms/step", steps, variants, "ours", "loop over members", shapes)
+    return Case("ensemble training", "ms/step", steps, variants, "loop over members", shapes)
 
 
 def rollouts(device: str, branches: int) -> Case:
@@ -165,7 +163,7 @@ def rollouts(device: str, branches: int) -> Case:
     }
     shapes: Shapes = Counter()
     _forward(shapes, [OBSERVATION + ACTION, *WIDE, 2 * (OBSERVATION + 1)], branches // 5, 1, 5)
-    return Case(f"{branches:,} rollouts", "ms", 1, variants, "ours", "all, then gather", shapes)
+    return Case(f"{branches:,} rollouts", "ms", 1, variants, "all, then gather", shapes)
 
 
 def whole_loop(device: str, target_steps: int, fit_steps: int) -> Case:
@@ -207,7 +205,7 @@ def whole_loop(device: str, target_steps: int, fit_steps: int) -> Case:
         return lambda: model.learn(target_steps, reset_num_timesteps=False)
 
     variants = {"plain": learn(PlainRPTO), "ours": learn(RPTO)}
-    return Case("RPTO.learn()", "ms/target step", target_steps, variants, "ours", "plain")
+    return Case("RPTO.learn()", "ms/target step", target_steps, variants, "plain")
 
 
 def _briefly(fit: Callable[..., Any], data: Transitions, weights: Any = None, max_steps: int | None = None) -> Any:
@@ -243,7 +241,7 @@ def columns(transitions: int) -> Case:
                 mujoco.mj_step(compiled, data, nstep=skip)
 
     variants = {"a compilation a column": one_by_one, "ours": batched}
-    return Case("columns of the fit", "ms", 1, variants, "ours", "a compilation a column")
+    return Case("columns of the fit", "ms", 1, variants, "a compilation a column")
 
 
 def _ensemble(cls: type[EnsembleDynamics], device: str, members: int = 7) -> EnsembleDynamics:
@@ -279,8 +277,3 @@ def _backward(
             shapes[n, n_in, batch, n_out] += times
         if layer or inputs:
             shapes[n, batch, n_out, n_in] += times
-
-
-def floor_of(case: Case, device: str) -> Callable[[], None]:
-    """The case's products alone."""
-    return products(case.floor, device)

@@ -54,13 +54,13 @@ def interleaved(variants: Variants, rounds: int, device: th.device | str = "cpu"
     return Times({name: np.array(values) for name, values in seconds.items()})
 
 
-def products(shapes: Mapping[tuple[int, int, int, int], float], device: th.device | str = "cpu") -> Callable[[], None]:
+def products(shapes: Mapping[tuple[int, int, int, int], int], device: th.device | str = "cpu") -> Callable[[], None]:
     """Matrix products alone, by the fastest means found here: what they take is the floor of what needs them.
 
     :param shapes: (batch, rows, inner, columns) -> how many
     :return: makes them all, and nothing else
     """
-    whole = [(_pair(*shape, device), round(count)) for shape, count in shapes.items()]
+    whole = [(_pair(*shape, device), count) for shape, count in shapes.items()]
 
     def run() -> None:
         with fast_products(device):
@@ -71,7 +71,7 @@ def products(shapes: Mapping[tuple[int, int, int, int], float], device: th.devic
     return run
 
 
-def flops(shapes: Mapping[tuple[int, int, int, int], float]) -> float:
+def flops(shapes: Mapping[tuple[int, int, int, int], int]) -> float:
     """Floating-point operations of the products."""
     return sum(2.0 * n * rows * inner * columns * count for (n, rows, inner, columns), count in shapes.items())
 
