@@ -174,10 +174,12 @@ def improvements(rows: pd.DataFrame, ours: Sequence[str]) -> pd.DataFrame:
 def costs(rows: pd.DataFrame, references: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
     """What each method spent for each target step, and how many it took to :data:`SHARE` of the oracle's return.
 
-    :param rows: columns task, target, label, seed, steps, return, updates, source_steps, seconds
+    :param rows: columns task, target, label, seed, steps, return, updates, source_steps, seconds; model_error where a
+        model was learned
     :param references: as :func:`scored` takes them
     :return: columns task, target, label, runs, budget, updates, source_steps, seconds (the last three for each target
-        step), reached (runs that did), steps_to (median of the first evaluations that did; infinite where half did not)
+        step), model_error (median at the end; NaN without a model), reached (runs that did), steps_to (median of the
+        first evaluations that did; infinite where half did not)
     """
     lines = []
     for (task, target, label), part in rows.groupby([*PLACE, "label"], sort=False):
@@ -186,6 +188,7 @@ def costs(rows: pd.DataFrame, references: Mapping[str, Mapping[str, float]]) -> 
         line: dict[str, Any] = {"task": task, "target": target, "label": label, "runs": part["seed"].nunique()}
         line |= {"budget": budget}
         line |= {name: float(last[name].mean()) / max(budget, 1) for name in ("updates", "source_steps", "seconds")}
+        line["model_error"] = float(last["model_error"].median()) if "model_error" in last else np.nan
         best = references.get(f"{task}_{target}", {}).get("oracle", np.nan)
         reached = [steps_to(one, best - (1 - SHARE) * abs(best)) for _, one in part.groupby("seed")]
         line |= {"reached": int(np.isfinite(reached).sum())}

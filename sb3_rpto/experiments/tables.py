@@ -41,7 +41,7 @@ class Study:
 
     :param manifest: of the folder
     :param rows: one line a run and evaluation: task, target, label, method, seed, steps, return, score, updates,
-        source_steps, seconds, factors
+        source_steps, seconds, factors; model_error where a model was learned
     :param failed: name and last line of the error of each run that failed
     :param left_out: runs of another source agent than the references'
     :param commits: of the runs
@@ -216,7 +216,7 @@ def _place(study: Study, tables: Mapping[str, pd.DataFrame], part: pd.DataFrame,
     points = sorted(set(part.loc[part["steps"] > 0, "steps"]))
     header = ["method", "runs", *(f"score at {p:,}" for p in points), f"return at {points[-1]:,}"]
     header += [*(f"P({our} better)" for our in study.ours), f"target steps to {SHARE_WORDS}", "updates / step"]
-    header += ["source steps / step", "ms / step"]
+    header += ["source steps / step", "ms / step", "model error"]
     lines = []
     for label in (known for known in study.labels if known in set(part["label"])):
         mine = part[part["label"] == label].set_index("steps")
@@ -225,7 +225,8 @@ def _place(study: Study, tables: Mapping[str, pd.DataFrame], part: pd.DataFrame,
         cells.append(_interval(mine.loc[points[-1]], "return", 0) if points[-1] in mine.index else "–")
         cells += [_better(better, our, label) for our in study.ours]
         cells += [_censored(cost), f"{cost['updates']:.3g}", f"{cost['source_steps']:.3g}"]
-        lines.append([*cells, f"{1_000 * cost['seconds']:.3g}"])
+        error = f"{cost['model_error']:.2g}" if math.isfinite(cost["model_error"]) else "–"
+        lines.append([*cells, f"{1_000 * cost['seconds']:.3g}", error])
     won = _at_first(tables["first"], f"{task} {target}")
     return _grid(header, lines) + f"\n\nFirst: {won}."
 
@@ -272,6 +273,8 @@ def _explained() -> str:
         "oracle's return, and how many runs had one. Censored at the budget: > means that half of the runs did not get "
         "there. It need not last.",
         "updates, source steps, ms": "of each target step, training alone: no evaluations, no phi_0, no cloning.",
+        "model error": "one-step error on all target transitions at the end, 1 = as large as a typical step's change; "
+        "median over runs.",
         "first": "the largest IQM of the return. It says nothing of whether the intervals overlap.",
     }
     return "\n".join(f"- **{name}**: {text}" for name, text in words.items())

@@ -85,6 +85,8 @@ def result(task: str, target: str, label: str, method: str, seed: int, returns: 
         {"steps": 10 * i, "return": value, **{name: 10 * i * each for name, each in spent.items()}}
         for i, value in enumerate(returns)
     ]
+    if method == "rpto":
+        rows = [{**row, "model_error": 0.1 * (1 + seed) + row["steps"]} for row in rows]
     made = {"name": f"{task}_{target}_{label}_{seed}", "job": {**job, "factors": {}}, "commit": "c0ffee", "error": None}
     return {**made, "source": {"sha256": "abc"}, "seconds": 9.0, "rows": rows}
 
@@ -139,6 +141,7 @@ def test_costs_and_the_first_step_at_ninety_percent(folder: Path) -> None:
     table = report.costs(tables.load(folder).rows, REFERENCES).set_index(["task", "label"])
     ours, theirs = table.loc[("Hopper", "rpto-x")], table.loc[("Hopper", "sac-warm")]
     assert (ours.updates, ours.source_steps, ours.seconds) == (5, 2, 0.25)
+    assert (ours.model_error, theirs.model_error) == (pytest.approx(20.2), pytest.approx(np.nan, nan_ok=True))
     assert (ours.reached, ours.steps_to) == (2, 20)  # 270 at 10, at 20, never
     assert (theirs.reached, theirs.steps_to) == (1, np.inf)
     # Returns below zero: within a tenth of the oracle's is -110.
