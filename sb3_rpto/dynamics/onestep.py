@@ -198,7 +198,7 @@ class OneStep:
         Steps from narrow and wide differences and of several sizes are simulated; the best is taken.
 
         :param values: phi, (p,)
-        :param max_step: largest change of a parameter, in scales
+        :param max_step: largest change of a parameter, as a share of its scale or its value, whichever is larger
         """
         self.unseen[:] = True
         trials = [values]
@@ -211,7 +211,7 @@ class OneStep:
         return trials[best] if costs[best] < costs[0] else None
 
     def _within(self, values: np.ndarray, residual: np.ndarray, slopes: np.ndarray, reach: float) -> np.ndarray:
-        """The weighted least-squares step in the bounds and within ``reach`` of each parameter, in scales."""
+        """The weighted least-squares step in the bounds and within a reach as :meth:`step` says."""
         root = np.sqrt(self.robust(residual))
         a, b = (root[:, :, None] * slopes).reshape(-1, len(values)), -(root * residual).reshape(-1)
         size = np.sqrt((a**2).sum(axis=0))
@@ -224,8 +224,9 @@ class OneStep:
             a = np.concatenate([a[:, free], np.diag(1e-4 * size[free])])
             b = np.concatenate([b, np.zeros(len(free))])
             low, high = ((bound - values)[free] / self.scale[free] for bound in (self.lower, self.upper))
+            far = reach * np.maximum(1.0, np.abs(values[free]) / self.scale[free])
             # The solver wants boxes with an inside.
-            box = np.minimum(np.maximum(low, -reach), -1e-12), np.maximum(np.minimum(high, reach), 1e-12)
+            box = np.minimum(np.maximum(low, -far), -1e-12), np.maximum(np.minimum(high, far), 1e-12)
             moved[free] += lsq_linear(a, b, box, method="bvls").x * self.scale[free]
         return np.clip(moved, self.lower, self.upper)
 

@@ -96,7 +96,8 @@ class PhysicalDynamics(Dynamics):
     :param frame_skip: simulation steps in one step of the environment
     :param declared: names of the model's numbers to train, as :func:`sb3_rpto.effects.declare` takes them
     :param effects: further effects to train, as :meth:`~sb3_rpto.effects.effect.Effect.to_json` describes them
-    :param max_step: largest change of a parameter in one step, in scales: its nominal value, or what is plausible
+    :param max_step: largest change of a parameter in one step, as a share of its value or its scale (its nominal value,
+        or what is plausible), whichever is larger
     :param max_steps: steps that a fit takes at most, unless it is told otherwise
     :param randomise: each source episode has a phi of its own, drawn from a normal distribution around the estimate
         with so many times its standard deviation; 0: the estimate itself

@@ -193,13 +193,25 @@ def test_a_step_lowers_the_cost_within_its_trusted_size(poles, max_step):
     task = problem(poles, SHIFTS[POLES], POLES)
     values = task.simulation.null
     for _ in range(2):
-        moved = task.step(values, max_step)
-        assert np.abs((moved - values) / task.scale).max() <= max_step * (1 + 1e-9)
+        moved, trusted = task.step(values, max_step), np.maximum(task.scale, np.abs(values))
+        assert np.abs((moved - values) / trusted).max() <= max_step * (1 + 1e-9)
         before, after = task.cost(task.residuals(np.stack([values, moved])))
         assert after < before
         values = moved
     if max_step < 0.1:  # far away the step is as long as it may be
-        assert np.abs((moved - task.simulation.null) / task.scale).max() == pytest.approx(2 * max_step)
+        assert np.abs((moved - task.simulation.null) / task.scale).max() == pytest.approx(2 * max_step, rel=max_step)
+
+
+def test_a_number_far_above_its_nominal_value_moves_by_shares_of_what_it_is():
+    task = problem(steps_of(collect(shifted(POLES, {"slider.damping": 1.0}), 60), POLES), ["slider.damping"], POLES)
+    nominal = float(task.simulation.null[0])
+    values = [task.simulation.null]
+    while len(values) < 40 and (moved := task.step(values[-1], 0.1)) is not None:
+        values.append(moved)
+    assert nominal == 0.05
+    np.testing.assert_allclose(values[-1], 1.0, rtol=1e-3)
+    grown = np.ravel(values[1:21]) / np.ravel(values[:20])
+    np.testing.assert_allclose(grown, 1.1, rtol=1e-6)
 
 
 def test_no_step_leaves_the_bounds(poles):
