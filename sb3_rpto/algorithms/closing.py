@@ -32,6 +32,8 @@ WORTH = 0.9
 FRESH = 10_000
 #: Of these, the first only fill D_source.
 FILL = 1_000
+#: Another simulator made D_source where the present one errs by so much on the oldest so many of its transitions.
+OTHER, OLDEST = 0.02, 500
 #: A corrected simulator must stay finite for so many steps from states of the target, as the uncorrected one does.
 TRIAL_STATES, TRIAL_STEPS = 16, 20
 
@@ -67,7 +69,7 @@ class LoopCloser:
         return dynamics.error(new) > RISEN * self._error
 
     def close(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:
-        """Trace on D_target, keep what lowers the error, log it, and renew D_source when phi has a new member."""
+        """Trace on D_target, keep what lowers the error, log it, and renew D_source where another simulator made it."""
         assert model.env is not None
         data = model.transitions("target")
         before = dynamics.error(data)
@@ -78,7 +80,7 @@ class LoopCloser:
         added = self._take(model, dynamics, report, data, before)
         self._error = dynamics.error(data)
         _say(model, report, added, f"{len(data)} target transitions", before, self._error)
-        if added:
+        if added or outdated(model, dynamics):
             renew_source(model, FRESH)
 
     def close_on_log(self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements) -> None:
@@ -174,6 +176,11 @@ def stays_finite(dynamics: PhysicalDynamics, data: Transitions) -> bool:
     count = max(1, len(data) - TRIAL_STEPS)
     first = np.unique(np.linspace(0, count - 1, TRIAL_STATES).astype(int))
     return dynamics.runs(data, first, min(TRIAL_STEPS, len(data)))
+
+
+def outdated(model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
+    """Whether D_source holds what another simulator than the present one produced."""
+    return dynamics.error(model.transitions("source").take(slice(OLDEST))) > OTHER
 
 
 def renew_source(model: TransferAlgorithm, n_steps: int) -> None:

@@ -12,7 +12,7 @@ import torch as th
 
 from sb3_rpto import RPTO
 from sb3_rpto.algorithms import closing
-from sb3_rpto.algorithms.closing import LoopCloser, stays_finite
+from sb3_rpto.algorithms.closing import LoopCloser, outdated, stays_finite
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
@@ -133,6 +133,22 @@ def test_nothing_is_added_where_nothing_is_missing(soon: None) -> None:
     made.loop.close(made, dynamics(made))
     assert made.loop.reports[0].verdict == "complete"
     assert dynamics(made).names == ["pole.length"]
+
+
+def test_what_other_declared_numbers_produced_is_dropped_too(soon: None) -> None:
+    made = model([])
+    made.learn(1, source_timesteps=60)
+    append(made, [], 100)
+    assert not outdated(made, dynamics(made))
+    dynamics(made).fit(made.transitions("target"), max_steps=30)
+    assert outdated(made, dynamics(made))
+    assert made.loop is not None
+    steps = made.source_timesteps
+    made.loop.close(made, dynamics(made))
+    assert made.source_timesteps - steps == made.replay_buffer.source.size() >= 50
+    assert not outdated(made, dynamics(made))
+    made.loop.close(made, dynamics(made))  # the source stays as it is where the simulator does
+    assert made.source_timesteps - steps == made.replay_buffer.source.size()
 
 
 def test_an_unstable_correction_is_refused(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
