@@ -10,6 +10,7 @@ import platform
 import subprocess
 from collections.abc import Mapping
 from enum import Enum
+from functools import cache
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -34,8 +35,12 @@ def versions() -> dict[str, str | None]:
     return found
 
 
+@cache
 def commit() -> str | None:
-    """The commit of the package's checkout, marked where it was changed; None outside of one."""
+    """The commit of the package's checkout, marked where it was changed; None outside of one.
+
+    It is looked up once in a process, whose code stays what it was when the checkout moves on: ask early.
+    """
     command = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
     try:
         done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)

@@ -275,7 +275,7 @@ def work(task: Task) -> Result:
         :func:`~sb3_rpto.experiments.run.transfer`
     """
     th.set_num_threads(1)
-    job, began = task.job, time.perf_counter()
+    job, began, made_by = task.job, time.perf_counter(), commit()
     arguments: dict[str, Any] = {}
     rows: list[dict[str, Any]] = []
     error = None
@@ -290,7 +290,7 @@ def work(task: Task) -> Result:
         "source": {"agent": Path(task.agent).name, "sha256": digest(task.agent), "data": task.data is not None},
         "target": {"id": env_id(job.task), "shift": job.target, "factors": make_shift(job.task, job.target).factors},
         "versions": versions(),
-        "commit": commit(),
+        "commit": made_by,
         **machine(),
         "seconds": round(time.perf_counter() - began, 2),
         "error": error,
