@@ -23,6 +23,10 @@ RIDGE = 30.0
 WIDE, NARROW = 1.0, 0.01
 #: Shares of a start's step that are tried.
 SHARES = (1.0, 0.2)
+#: Changes of the damping that are tried, in their turn: the first alone where its step does as promised.
+LADDER = ((0.1,), (1.0, 10.0, 100.0), (1e4, 1e6))
+#: Share of the promised fall of the cost that is enough to take a step without looking further.
+KEPT = 0.5
 #: Most simulations in one batch.
 CHUNK = 6000
 
@@ -35,12 +39,14 @@ class Fit:
     :param starts: corrections of the windows' starts, in units of their spread, (W, 2 nv)
     :param errors: root mean squared residual of each window in units of the noise, (W,)
     :param cost: robust cost, comparable between fits of like size only
+    :param linear: the cost around it, where it is known
     """
 
     values: np.ndarray
     starts: np.ndarray
     errors: np.ndarray
     cost: float
+    linear: Linear | None = None
 
 
 @dataclass(frozen=True)
@@ -202,6 +208,7 @@ class Problem:
         wt = jt * weight[:, :, None]
         normal, gradient = np.einsum("wrf,wrg->wfg", wt, jt), np.einsum("wrf,wr->wf", wt, r)
         gain, move = np.zeros((len(r), jx.shape[2], jt.shape[2])), np.zeros((len(r), jx.shape[2]))
+        fall = np.zeros(len(r))
         if jx.shape[2]:
             wx = jx * weight[:, :, None]
             hxx = np.einsum("wrx,wry->wxy", wx, jx) + loss.hold * np.eye(jx.shape[2])
@@ -210,7 +217,8 @@ class Problem:
             gain, move = np.linalg.solve(hxx, hxt), np.linalg.solve(hxx, gx[:, :, None])[:, :, 0]
             normal = normal - np.einsum("wxf,wxg->wfg", hxt, gain)
             gradient = gradient - np.einsum("wxf,wx->wf", hxt, move)
-        return _Reduced(normal, gradient, gain, move)
+            fall = (gx * move).sum(-1)
+        return _Reduced(normal, gradient, gain, move, fall)
 
     def cost(self, r: np.ndarray, starts: np.ndarray, values: np.ndarray, loss: Loss) -> np.ndarray:
         """Robust cost of one or more candidates: r (..., W, R), starts (..., W, 2 nv), values (..., p)."""
@@ -234,24 +242,53 @@ class Problem:
         :param tolerance: stop when the cost falls by less than this share
         :return: never worse than where it began
         """
-        values, damping = values.copy(), 1e-3
+        values, damping, linear = values.copy(), 1e-3, None
         starts = np.zeros((len(self.windows), 2 * self.simulation.model.nv)) if starts is None else starts.copy()
         for _ in range(iterations):
             r, jt, jx = self.linearise(values, starts, free)
             loss = Loss.of(r)
             now = float(self.cost(r, starts, values, loss))
             reduced = self.reduce(r, jt, jx, starts, loss)
-            for dampings in (damping * np.array([0.1, 1.0, 10.0, 100.0]), damping * np.array([1e4, 1e6])):
-                trial = self._try(values, starts, free, reduced, dampings if len(free) else dampings[:1], loss)
-                costs = self.cost(trial.residuals, trial.starts, trial.values, loss)
-                best = int(np.argmin(costs))
-                if costs[best] < now:
-                    values, starts, r = trial.values[best], trial.starts[best], trial.residuals[best]
-                    damping = float(np.clip(dampings[best], 1e-6, 1e6))
-                    break
-            if now - costs[best] < tolerance * now:
+            promised = self._promise(values, free, reduced, LADDER[0][0] * damping)
+            if promised < tolerance * now:
+                linear = Linear(reduced.normal, reduced.gradient, free)
                 break
-        return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, Loss.of(r))))
+            step = self._descend(values, starts, free, reduced, damping, loss, now, promised)
+            if step.cost < now:
+                values, starts, r = step.values, step.starts, step.residuals
+                damping = float(np.clip(step.damping, 1e-6, 1e6))
+            if now - step.cost < tolerance * now:
+                break
+        return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, Loss.of(r))), linear)
+
+    def _promise(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced, damping: float) -> float:
+        """How far the cost would fall with a step if it were quadratic."""
+        z = self._step(values, free, reduced, damping)[free] / self.size[free]
+        normal, gradient = self._normal(values, free, reduced)
+        return float(reduced.fall.sum() - 2 * gradient @ z - z @ normal @ z)
+
+    def _descend(
+        self,
+        values: np.ndarray,
+        starts: np.ndarray,
+        free: np.ndarray,
+        reduced: _Reduced,
+        damping: float,
+        loss: Loss,
+        now: float,
+        promised: float,
+    ) -> _Step:
+        """The best step of the first rung of dampings that lowers the cost; of the lowest rung, by what it promised."""
+        best, enough = None, now - KEPT * promised
+        for factors in LADDER if len(free) else LADDER[:1]:
+            step = self._try(values, starts, free, reduced, damping * np.array(factors), loss)
+            if best is None or step.cost < best.cost:
+                best = step
+            if best.cost < enough:
+                break
+            enough = now
+        assert best is not None  # the ladder has rungs
+        return best
 
     def _try(
         self,
@@ -261,8 +298,8 @@ class Problem:
         reduced: _Reduced,
         dampings: np.ndarray,
         loss: Loss,
-    ) -> _Trial:
-        """Simulate the steps of several dampings side by side.
+    ) -> _Step:
+        """Simulate the steps of several dampings side by side, and take the best.
 
         Each window takes what suits it of its start's own step: near an unstable pose a whole step may lead astray.
         """
@@ -278,37 +315,47 @@ class Problem:
             trial_starts.reshape(len(SHARES) * tries * count, -1),
             np.tile(np.arange(count), len(SHARES) * tries),
         ).reshape(len(SHARES), tries, count, -1)
-        best = np.argmin(loss.energy(r, trial_starts), axis=0)
-        pick = best, np.arange(tries)[:, None], np.arange(count)
-        return _Trial(trial_values, trial_starts[pick], r[pick])
+        share = np.argmin(loss.energy(r, trial_starts), axis=0), np.arange(tries)[:, None], np.arange(count)
+        costs = self.cost(r[share], trial_starts[share], trial_values, loss)
+        best = int(np.argmin(costs))
+        return _Step(
+            trial_values[best], trial_starts[share][best], r[share][best], float(costs[best]), float(dampings[best])
+        )
 
     def _step(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced, damping: float) -> np.ndarray:
         """A damped Gauss-Newton step within the bounds, (p,); what would leave them is held there."""
         step = np.zeros(len(values))
         if not len(free):
             return step
-        normal, gradient = reduced.normal.sum(0), reduced.gradient.sum(0)
-        pull = np.where(self.declared[free], 0.0, 1 / RIDGE**2)
-        z = (values[free] - self.null[free]) / self.size[free]
-        gradient = gradient + pull * z
-        normal = normal + np.diag(pull + damping * (np.diag(normal) + 1e-3 * np.diag(normal).max() + 1e-12))
+        normal, gradient = self._normal(values, free, reduced)
+        normal = normal + damping * np.diag(np.diag(normal) + 1e-3 * np.diag(normal).max() + 1e-12)
         low, high = ((b[free] - values[free]) / self.size[free] for b in (self.lower, self.upper))
         step[free] = bounded_step(normal, gradient, low, high) * self.size[free]
         return np.clip(values + step, self.lower, self.upper) - values
 
+    def _normal(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced) -> tuple[np.ndarray, np.ndarray]:
+        """The normal equations of all windows with the pull towards the null values, (f, f) and (f,)."""
+        pull = np.where(self.declared[free], 0.0, 1 / RIDGE**2)
+        z = (values[free] - self.null[free]) / self.size[free]
+        return reduced.normal.sum(0) + np.diag(pull), reduced.gradient.sum(0) + pull * z
+
     def linear(self, fit: Fit, free: np.ndarray) -> Linear:
         """The reduced normal equations at a fit, for screening, elimination and intervals."""
+        if fit.linear is not None and np.array_equal(fit.linear.free, free):
+            return fit.linear
         r, jt, jx = self.linearise(fit.values, fit.starts, free)
         reduced = self.reduce(r, jt, jx, fit.starts, Loss.of(r))
         return Linear(reduced.normal, reduced.gradient, free)
 
-    def score(self, values: np.ndarray, iterations: int = 2) -> Fit:
+    def score(self, values: np.ndarray, starts: np.ndarray | None = None, iterations: int = 2) -> Fit:
         """Errors of the windows with the parameters given and their starts fitted.
 
         :param values: (p,), or (W, p) for parameters of its own in each window
+        :param starts: where to begin, as in :class:`Fit`; default: the smoothed states
+        :param iterations: Gauss-Newton steps of the starts
         """
         count, none = len(self.windows), np.empty(0, dtype=int)
-        starts = np.zeros((count, 2 * self.simulation.model.nv))
+        starts = np.zeros((count, 2 * self.simulation.model.nv)) if starts is None else starts.copy()
         rows = np.broadcast_to(values, (count, values.shape[-1]))
         best = self.residuals(rows, starts, np.arange(count))
         for _ in range(iterations if len(self.moving) else 0):
@@ -345,13 +392,16 @@ class _Reduced:
     gradient: np.ndarray  # (W, f)
     gain: np.ndarray  # (W, x, f), how the starts follow the parameters
     move: np.ndarray  # (W, x), how the starts move by themselves
+    fall: np.ndarray  # (W,), of the energy by that
 
 
 @dataclass(frozen=True)
-class _Trial:
-    values: np.ndarray  # (t, p)
-    starts: np.ndarray  # (t, W, 2 nv)
-    residuals: np.ndarray  # (t, W, R)
+class _Step:
+    values: np.ndarray  # (p,)
+    starts: np.ndarray  # (W, 2 nv)
+    residuals: np.ndarray  # (W, R)
+    cost: float
+    damping: float
 
 
 def bounded_step(normal: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -168,6 +168,7 @@ class Selector:
             if i not in key and self.simulation.effects[i].kind != "declared":
                 values[s] = self.simulation.null[s]
         fit = self.train.fit(values, self.free(key), begin.starts, iterations, tolerance=3e-3)
+        fit = replace(fit, linear=self.train.linear(fit, self.free(key)))
         found = Model(key, fit, self._errors(fit, key))
         self._memory[key] = found
         return found
@@ -188,7 +189,7 @@ class Selector:
                 normal = normal + np.diag(1e-3 * np.diag(normal) + 1e-9)
                 move = bounded_step(normal, gradient, low, high) * train.size[free]
                 rows[np.ix_(judged, free)] += move
-        errors = train.score(rows).errors
+        errors = train.score(rows, fit.starts, iterations=1).errors
         unseen = [errors[judged] for _, judged in self.folds]
         return np.concatenate([*unseen, self.select.score(fit.values).errors] if self.select else unseen)
 
@@ -326,7 +327,7 @@ class Selector:
             begin = model.fit
             for old, new in swaps.items():
                 moved = self._translated(model, old, new).values[self.simulation.slices[new]]
-                begin = replace(begin, values=begin.values.copy())
+                begin = replace(begin, values=begin.values.copy(), linear=None)
                 begin.values[self.simulation.slices[new]] = moved
             trial = self.model(trial_effects, begin, 2 * REFIT)
             if self.evidence(trial, model).clear(SEEMS):
@@ -352,7 +353,7 @@ class Selector:
         values[new_free] = self.simulation.null[new_free] + self.train.size[new_free] * np.linalg.solve(
             inner, normal[k:, :k] @ z
         )
-        return replace(model.fit, values=np.clip(values, self.train.lower, self.train.upper))
+        return replace(model.fit, values=np.clip(values, self.train.lower, self.train.upper), linear=None)
 
     def _better(self, a: Model, b: Model) -> bool:
         """Whether one of two likes does better: near the noise that seems so soon, far from it it must be clear."""

@@ -251,6 +251,43 @@ def test_a_fit_is_never_worse_than_where_it_began(damping: float, mass: float, s
     assert np.all((fit.values >= p.lower) & (fit.values <= p.upper))
 
 
+def test_a_fit_that_came_to_rest_knows_the_cost_around_it() -> None:
+    task, free = declared_problem(), np.arange(2)
+    fit = task.fit(task.simulation.null, free, tolerance=1e-6)
+    assert fit.linear is not None
+    assert task.linear(fit, free) is fit.linear
+    again = task.linear(replace(fit, linear=None), free)
+    np.testing.assert_array_equal(fit.linear.normal, again.normal)
+    np.testing.assert_array_equal(fit.linear.gradient, again.gradient)
+    np.testing.assert_array_equal(task.linear(fit, free[1:]).free, [1])
+
+
+@pytest.mark.parametrize(("enough", "rungs"), [(-np.inf, [1]), (np.inf, [1, 3])])
+def test_dampings_are_tried_until_the_cost_falls_as_promised(enough: float, rungs: list[int], monkeypatch) -> None:
+    task, tried = declared_problem(), []
+    one_rung = task._try
+    monkeypatch.setattr(task, "_try", lambda *a: tried.append(len(a[4])) or one_rung(*a))
+    monkeypatch.setattr(task, "_promise", lambda *a: enough)
+    task.fit(task.simulation.null, np.arange(2), iterations=1, tolerance=-np.inf)
+    assert tried == rungs
+
+
+def test_a_small_step_lowers_the_cost_as_promised(monkeypatch) -> None:
+    task, free, falls = declared_problem(), np.arange(2), []
+    descend = task._descend
+
+    def seen(*a):
+        step = descend(*a)
+        falls.append(((a[6] - step.cost) / a[6], a[7] / a[6]))
+        return step
+
+    monkeypatch.setattr(task, "_descend", seen)
+    begin = task.fit(task.simulation.null, free).values * [1.02, 0.998]
+    task.fit(begin, free)
+    assert falls[0][0] > 0.01
+    assert falls[0][0] == pytest.approx(falls[0][1], rel=0.2)
+
+
 def test_what_is_not_free_stays() -> None:
     p = declared_problem()
     begin = np.array([0.06, 0.4])
@@ -268,6 +305,13 @@ def test_a_score_may_have_parameters_of_its_own_in_each_window() -> None:
     np.testing.assert_allclose(mixed.errors[::2], even.errors[::2], rtol=1e-9)
     np.testing.assert_allclose(mixed.errors[1::2], odd.errors[1::2], rtol=1e-9)
     assert not np.allclose(even.errors, odd.errors, rtol=0.1)
+
+
+def test_a_score_may_begin_at_starts_that_are_known() -> None:
+    task = declared_problem()
+    fit = task.fit(task.simulation.null, np.arange(2), tolerance=1e-9)
+    np.testing.assert_allclose(task.score(fit.values, fit.starts, iterations=1).errors, fit.errors, rtol=1e-3)
+    np.testing.assert_array_equal(task.score(fit.values, fit.starts, iterations=0).starts, fit.starts)
 
 
 def test_a_simulation_without_parameters_is_fitted_in_its_starts() -> None:
