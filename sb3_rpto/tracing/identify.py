@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from sb3_rpto.effects import Scales, Simulation
-from sb3_rpto.effects.effect import Effect
 from sb3_rpto.tracing.windows import Windows
 
 #: Where a simulation became unstable, its residual in units of the noise.
@@ -450,42 +449,3 @@ def interpolate(
     d0 = np.where(dofs >= 0, dt * v[rows, k][:, :, dofs], slope)
     d1 = np.where(dofs >= 0, dt * v[rows, k + 1][:, :, dofs], slope)
     return q0 + s * (d0 + s * ((3 * slope - 2 * d0 - d1) + s * (d0 + d1 - 2 * slope)))
-
-
-def scales_for(effects: Sequence[Effect], typical: Typical) -> list[Scales]:
-    """What is large at the place of each bound effect."""
-    return [typical.at(e) for e in effects]
-
-
-@dataclass(frozen=True)
-class Typical:
-    """Typical magnitudes in the data, joint by joint and actuator by actuator.
-
-    :param torque: peak generalised force, (nv,)
-    :param velocity: peak speed, (nv,)
-    :param inertia: diagonal of the mass matrix, (nv,)
-    :param span: range of positions, (nv,)
-    :param command: peak command, (nu,)
-    :param mass: of each body, (nbody,)
-    """
-
-    torque: np.ndarray
-    velocity: np.ndarray
-    inertia: np.ndarray
-    span: np.ndarray
-    command: np.ndarray
-    mass: np.ndarray
-
-    def at(self, effect: Effect) -> Scales:
-        """The scales where a bound effect sits."""
-        total = float(self.mass.sum())
-        names = ("torque", "velocity", "command", "inertia", "span")
-        rest = Scales(**{n: float(getattr(self, n).max(initial=1e-9)) for n in names}, mass=total)
-        if effect.place in ("joint", "sensor"):
-            at = {n: float(getattr(self, n)[effect.dof]) for n in ("torque", "velocity", "inertia", "span")}
-            return replace(rest, **at)
-        if effect.place == "actuator":
-            return replace(rest, command=float(self.command[effect.index]))
-        if effect.place == "body":
-            return replace(rest, mass=float(self.mass[effect.index]))
-        return rest

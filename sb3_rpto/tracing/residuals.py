@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from scipy.signal import butter, filtfilt
 
-from sb3_rpto.effects import Simulation
+from sb3_rpto.effects import Effect, Scales, Simulation
 from sb3_rpto.effects.simulation import filter_commands, names_of, prepare
 from sb3_rpto.effects.world import BatchWorld
 from sb3_rpto.tracing.checks import MIN_ROWS
 from sb3_rpto.tracing.episodes import Episode
-from sb3_rpto.tracing.identify import Typical
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.windows import command_order, scalar_joints, velocity_addresses
 
@@ -140,6 +139,44 @@ def _low_pass(h: float, length: int) -> Callable[[np.ndarray], np.ndarray]:
     b, a = butter(2, 2 * _cutoff(h) * h)
     pad = min(length - 1, 60)
     return lambda signal: filtfilt(b, a, signal, padlen=pad)
+
+
+@dataclass(frozen=True)
+class Typical:
+    """Typical magnitudes in the data, joint by joint and actuator by actuator.
+
+    :param torque: peak generalised force, (nv,)
+    :param velocity: peak speed, (nv,)
+    :param inertia: diagonal of the mass matrix, (nv,)
+    :param span: range of positions, (nv,)
+    :param command: peak command, (nu,)
+    :param mass: of each body, (nbody,)
+    """
+
+    torque: np.ndarray
+    velocity: np.ndarray
+    inertia: np.ndarray
+    span: np.ndarray
+    command: np.ndarray
+    mass: np.ndarray
+
+    def at(self, effect: Effect) -> Scales:
+        """The scales where a bound effect sits."""
+        total = float(self.mass.sum())
+        names = ("torque", "velocity", "command", "inertia", "span")
+        rest = Scales(**{n: float(getattr(self, n).max(initial=1e-9)) for n in names}, mass=total)
+        if effect.place in ("joint", "sensor"):
+            at = {n: float(getattr(self, n)[effect.dof]) for n in ("torque", "velocity", "inertia", "span")}
+            return replace(rest, **at)
+        if effect.place == "actuator":
+            return replace(rest, command=float(self.command[effect.index]))
+        if effect.place == "body":
+            return replace(rest, mass=float(self.mass[effect.index]))
+        return rest
+
+    def scales(self, effects: Sequence[Effect]) -> list[Scales]:
+        """Those of each of several bound effects."""
+        return [self.at(e) for e in effects]
 
 
 def typical(simulation: Simulation, residuals: list[ForceResidual]) -> Typical:

@@ -17,7 +17,7 @@ from sb3_rpto.tracing.adequacy import Adequacy, adequacy
 from sb3_rpto.tracing.calibrate import calibrated
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
-from sb3_rpto.tracing.identify import Fit, Problem, scales_for
+from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.model_checks import check_against
 from sb3_rpto.tracing.report import Candidate, Report, Traced
@@ -83,7 +83,7 @@ def trace(
     known = declare(nominal, declared)
     effects: list[Effect] = [*known, *_candidates(nominal, [d.label for d in known], candidates)]
     simulation = Simulation(nominal, effects, threads)
-    scales = scales_for(effects, typical(simulation, force_residuals(simulation, simulation.null, fitted)))
+    scales = typical(simulation, force_residuals(simulation, simulation.null, fitted)).scales(effects)
     windows = _windows(nominal, train, select, sigma, horizon)
     if windows[1] is None:
         message = f"selected on {len(windows[0])} windows of the training runs by cross-validation over blocks"

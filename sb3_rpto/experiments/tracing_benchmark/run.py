@@ -25,7 +25,7 @@ from sb3_rpto.experiments.tracing_benchmark.design import Case, design
 from sb3_rpto.experiments.tracing_benchmark.truth import Set, make
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors
-from sb3_rpto.tracing.identify import Problem, scales_for
+from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.report import write_atomically
 from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.windows import cut
@@ -166,7 +166,7 @@ def true_structure(report: Report, data: Measurements, effects: Sequence[Effect]
     train, select, _ = data.split(report.seed)
     fitted = replace(data, episodes=train.episodes + select.episodes)
     windows = cut(simulation.model, fitted, report.sigma, report.horizon, WINDOWS)
-    scales = scales_for(simulation.effects, typical(simulation, force_residuals(simulation, simulation.null, fitted)))
+    scales = typical(simulation, force_residuals(simulation, simulation.null, fitted)).scales(simulation.effects)
     problem = Problem(simulation, windows, scales)
     values, free = report.values_before.copy(), problem.declared.copy()
     for effect in effects:
