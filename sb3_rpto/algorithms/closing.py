@@ -184,7 +184,7 @@ def outdated(model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
 
 
 def renew_source(model: TransferAlgorithm, n_steps: int) -> None:
-    """Drop what an uncorrected source produced, and learn in the corrected one before learning goes on.
+    """Drop what another simulator produced, and learn in the present one before learning goes on.
 
     :param n_steps: to take there; after the first :data:`FILL` of them with their updates
     """

@@ -9,8 +9,9 @@ from itertools import combinations
 import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
+from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
-from sb3_rpto.tracing.identify import Fit, Problem, bounded_step
+from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.windows import Windows
 

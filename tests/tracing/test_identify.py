@@ -16,7 +16,8 @@ from sb3_rpto.effects.effect import Effect, Parameter
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.effects.sensors import SensorBias
-from sb3_rpto.tracing.identify import RIDGE, TRUST, UNSTABLE, Loss, Problem, bounded_step, interpolate
+from sb3_rpto.tracing.box import bounded_step
+from sb3_rpto.tracing.identify import RIDGE, TRUST, UNSTABLE, Loss, Problem, interpolate
 
 DECLARED = ["hinge.damping", "pole.mass"]
 TRUE = np.array([0.08, 0.62])
