@@ -10,6 +10,7 @@ import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.tracing.box import bounded_step
+from sb3_rpto.tracing.concentrate import concentrated
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.screen import Screening
@@ -168,11 +169,18 @@ class Selector:
         for i, s in enumerate(self.simulation.slices):
             if i not in key and self.simulation.effects[i].kind != "declared":
                 values[s] = self.simulation.null[s]
-        fit = self.train.fit(values, self.free(key), begin.starts, iterations, tolerance=3e-3)
-        fit = replace(fit, linear=self.train.linear(fit, self.free(key)))
-        found = Model(key, fit, self._errors(fit, key))
-        self._memory[key] = found
-        return found
+        return self._remembered(key, self.train.fit(values, self.free(key), begin.starts, iterations, tolerance=3e-3))
+
+    def led_on(self, model: Model) -> Model:
+        """A model whose errors are far from the noise, out of the kinks that may hold its fit."""
+        if not self.far(model):
+            return model
+        return self._remembered(model.effects, concentrated(self.train, model.fit, self.free(model.effects)))
+
+    def _remembered(self, effects: tuple[int, ...], fit: Fit) -> Model:
+        fit = replace(fit, linear=self.train.linear(fit, self.free(effects)))
+        self._memory[effects] = Model(effects, fit, self._errors(fit, effects))
+        return self._memory[effects]
 
     def _errors(self, fit: Fit, effects: Sequence[int]) -> np.ndarray:
         """Errors on windows that the parameters were not fitted to.

@@ -16,6 +16,7 @@ from sb3_rpto.effects.model import load_model
 from sb3_rpto.tracing.adequacy import Adequacy, adequacy
 from sb3_rpto.tracing.calibrate import calibrated
 from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.concentrate import concentrated
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.measurements import Measurements
@@ -171,7 +172,7 @@ def _steady(progress: Progress | None) -> Progress:
 
 
 def fit_declared(selector: Selector, seed: int) -> Fit:
-    """Fit the declared parameters from several starts, none at a bound, and keep the best."""
+    """Fit the declared parameters from several starts, none at a bound, and lead the best one on."""
     problem, free = selector.train, selector.free(())
     begin = problem.simulation.null.copy()
     best = problem.fit(begin, free, iterations=20)
@@ -186,7 +187,7 @@ def fit_declared(selector: Selector, seed: int) -> Fit:
         other = problem.fit(start, free, iterations=20)
         if other.cost < 0.999 * best.cost:
             best = other
-    return best
+    return concentrated(problem, best, free)
 
 
 def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
@@ -221,7 +222,7 @@ def search(selector: Selector, rough: Selector, base: Model, screening: Screenin
     selection = rough.eliminate(selection)
     say(0.7, "trying like effects in their place")
     selection = rough.merge(rough.substitute(selection, screening), screening)
-    selection.model = selector.model(selection.model.effects, selection.model.fit, iterations=10)
+    selection.model = selector.led_on(selector.model(selection.model.effects, selection.model.fit, iterations=10))
     return selector.judge(selection)
 
 
