@@ -1,0 +1,100 @@
+"""Fits that contacts hold in kinks, led on: exact data of a walker, whose truth is known to the last digit."""
+
+from functools import cache
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from sb3_rpto.effects import Simulation, declare
+from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.tracing import Measurements, trace
+from sb3_rpto.tracing.concentrate import ENOUGH, concentrated
+from sb3_rpto.tracing.identify import Problem
+from sb3_rpto.tracing.residuals import force_residuals, typical
+from sb3_rpto.tracing.windows import cut, discretised, noise_levels
+
+pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute")
+
+NAMES = ["torso.length", "?thigh.length", "?shin.length", "?foot.length", "torso.mass"]
+TRUE = np.random.default_rng(0).uniform(0.8, 1.2, 8)  # shares of the nominal values
+HORIZON = 0.15
+
+
+@cache
+def walk(shares: tuple[float, ...] = tuple(TRUE), steps: int = 200, seed: int = 0) -> Measurements:
+    """A HalfCheetah with other lengths that falls over itself at random."""
+    source = gym.make("HalfCheetah-v5")
+    known = declare(source.unwrapped.model, NAMES)
+    env = apply_effects(source, [d.with_values(d.values * s) for d, s in zip(known, shares)])
+    buffer = ReplayBuffer(steps, env.observation_space, env.action_space, "cpu")
+    rng = np.random.default_rng(seed)
+    obs, _ = env.reset(seed=seed)
+    for _ in range(steps):
+        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        after, reward, *_ = env.step(action)
+        buffer.add(obs, after, action, np.array([reward]), np.array([False]), [{}])
+        obs = after
+    return Measurements.from_replay(buffer, gym.make("HalfCheetah-v5"))
+
+
+@cache
+def lengths() -> Problem:
+    data = walk()
+    model = discretised(gym.make("HalfCheetah-v5").unwrapped.model, data, fine=True)
+    simulation = Simulation(model, declare(model, NAMES), 1)
+    scales = typical(simulation, force_residuals(simulation, simulation.null, data)).scales(simulation.effects)
+    return Problem(simulation, cut(model, data, noise_levels(data), HORIZON, 40), scales)
+
+
+def test_a_walkers_lengths_are_found_where_contacts_hold_a_plain_fit() -> None:
+    problem = lengths()
+    free = np.arange(len(TRUE))
+    true = problem.null * TRUE
+    plain = problem.fit(problem.null, free, iterations=100, tolerance=1e-9)
+    led = concentrated(problem, plain, free)
+    assert problem.score(true).errors.max() < 1e-6  # the truth is there to be found
+    assert plain.errors.max() > 100 * ENOUGH  # and a descent does not get there
+    assert led.errors.max() < ENOUGH
+    np.testing.assert_allclose(led.values, true, rtol=1e-4)
+
+
+def test_the_trace_of_a_walker_without_missing_effect_names_none() -> None:
+    report = trace(gym.make("HalfCheetah-v5"), walk(), NAMES, horizon=HORIZON, threads=1)
+    assert report.verdict == "complete"
+    assert not report.effects
+    found = np.array([traced.effect.values[0] for traced in report.declared])
+    np.testing.assert_allclose(found, lengths().null * TRUE, rtol=1e-4)
+
+
+def test_a_fit_near_the_noise_stays() -> None:
+    problem = lengths()
+    fit = problem.score(problem.null * TRUE)
+    assert concentrated(problem, fit, np.arange(len(TRUE))) is fit
+
+
+def test_a_fit_without_free_parameters_stays() -> None:
+    problem = lengths()
+    fit = problem.score(problem.null)
+    assert concentrated(problem, fit, np.empty(0, dtype=int)) is fit
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_never_ends_higher_than_it_began(seed: int) -> None:
+    problem = lengths()
+    few = problem.on(np.arange(seed, len(problem.windows), 5))
+    begin = few.score(problem.null * np.random.default_rng(seed).uniform(0.8, 1.2, len(TRUE)))
+    assert concentrated(few, begin, np.arange(4)).cost <= begin.cost
+
+
+def test_a_parameter_that_shows_nowhere_goes_back_to_where_it_may_show() -> None:
+    """Feet of friction 0.4 hide a floor's below that: a fit that came there would stay for ever."""
+    data = walk()
+    model = discretised(gym.make("HalfCheetah-v5").unwrapped.model, data, fine=True)
+    simulation = Simulation(model, declare(model, ["floor.friction", "torso.mass"]), 1)
+    scales = typical(simulation, force_residuals(simulation, simulation.null, data)).scales(simulation.effects)
+    problem = Problem(simulation, cut(model, data, noise_levels(data), HORIZON, 40), scales)
+    hidden = problem.score(problem.null * [0.5, 1.0])
+    led = concentrated(problem, hidden, np.arange(2))
+    assert led.values[0] >= problem.null[0]
