@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.tracing.box import bounded_step
-from sb3_rpto.tracing.concentrate import concentrated
+from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.screen import Screening
@@ -175,7 +175,7 @@ class Selector:
         """A model whose errors are far from the noise, out of the kinks that may hold its fit."""
         if not self.far(model):
             return model
-        return self._remembered(model.effects, concentrated(self.train, model.fit, self.free(model.effects)))
+        return self._remembered(model.effects, led_on(self.train, model.fit, self.free(model.effects)))
 
     def _remembered(self, effects: tuple[int, ...], fit: Fit) -> Model:
         fit = replace(fit, linear=self.train.linear(fit, self.free(effects)))

@@ -16,7 +16,7 @@ from sb3_rpto.effects.model import load_model
 from sb3_rpto.tracing.adequacy import Adequacy, adequacy
 from sb3_rpto.tracing.calibrate import calibrated
 from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.concentrate import concentrated
+from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.measurements import Measurements
@@ -187,7 +187,7 @@ def fit_declared(selector: Selector, seed: int) -> Fit:
         other = problem.fit(start, free, iterations=20)
         if other.cost < 0.999 * best.cost:
             best = other
-    return concentrated(problem, best, free)
+    return led_on(problem, best, free)
 
 
 def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
