@@ -116,7 +116,8 @@ def test_every_logged_key_is_explained_and_every_explained_key_is_logged(tmp_pat
     model = RPTO("MlpPolicy", cartpole, target_env=gym.make(cartpole, pole_length=2.0), gradient_steps=1, **physical)
     keys |= logged(model)
     monkeypatch.setattr(closing, "FIRST", 80)
-    monkeypatch.setattr(closing, "FRESH", 50)
+    monkeypatch.setattr(closing, "FILL", 25)
+    monkeypatch.setattr(closing, "FRESH", 25)
     double = "InvertedDoublePendulum-v5"
     target = apply_effects(gym.make(double), [LIBRARY["coulomb_friction"]("slider", level=5.0)])
     settings = {"declared": ["pole.length"], "close_loop": ["coulomb_friction"], "model_train_freq": 40}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Declared
@@ -27,11 +28,11 @@ RISEN = 2.0
 WINDOW = 4
 #: What is found is kept when the one-step error falls below this share of the best without it.
 WORTH = 0.9
-#: Source steps taken in the corrected simulator, with the updates that belong to them, before the next target step:
-#: there the policy learns what it can for nothing.
-FRESH = 10_000
-#: Of these, the first only fill D_source.
+#: Source steps that fill D_source anew.
 FILL = 1_000
+#: Then the policy learns in the corrected simulator what it can for nothing, before the next target step: in rounds of
+#: so many source steps, until so many rounds in a row earned no more than the best one, or all these steps are taken.
+ROUND, PATIENCE, FRESH = 20_000, 2, 100_000
 #: Another simulator made D_source where the present one errs by so much on the oldest so many of its transitions.
 OTHER, OLDEST = 0.02, 500
 #: A corrected simulator must stay finite for so many steps from states of the target, as the uncorrected one does.
@@ -81,7 +82,8 @@ class LoopCloser:
         self._error = dynamics.error(data)
         _say(model, report, added, f"{len(data)} target transitions", before, self._error)
         if added or outdated(model, dynamics):
-            renew_source(model, FRESH)
+            renew_source(model)
+            learn_in_source(model)
 
     def close_on_log(self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements) -> None:
         """Trace on a robot's log itself, by multiple shooting: one-step errors of noisy samples tell next to nothing.
@@ -101,7 +103,7 @@ class LoopCloser:
         """Drop what is :attr:`stale`, if anything is; a budget of source steps is for the loop to learn on."""
         if self.stale:
             self.stale = False
-            renew_source(model, FILL)
+            renew_source(model)
 
     def _trace(
         self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements, horizon: float | None
@@ -183,18 +185,30 @@ def outdated(model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
     return dynamics.error(model.transitions("source").take(slice(OLDEST))) > OTHER
 
 
-def renew_source(model: TransferAlgorithm, n_steps: int) -> None:
-    """Drop what another simulator produced, and learn in the present one before learning goes on.
-
-    :param n_steps: to take there; after the first :data:`FILL` of them with their updates
-    """
-    source = model._source_world
-    assert source is not None
+def renew_source(model: TransferAlgorithm) -> None:
+    """Drop what another simulator produced, and take the first :data:`FILL` steps in the present one."""
+    assert model._source_world is not None
     model.replay_buffer.source.reset()
-    steps = source.interact(model, min(FILL, n_steps))
+    model.source_timesteps += model._source_world.interact(model, FILL)
+
+
+def learn_in_source(model: TransferAlgorithm) -> None:
+    """Learn in the present simulator by rounds while its episodes earn more; the target waits meanwhile."""
+    source = model._source_world
+    assert isinstance(source, EpisodeSource)
     updates_per_step = max(model.gradient_steps, 1) / int(model.source_steps)
-    while steps < n_steps:
-        taken = source.interact(model, int(model.source_steps))
-        model.train(round(taken * updates_per_step), model.batch_size)
-        steps += taken
+    best, idle, steps = -math.inf, 0, 0
+    while steps < FRESH and idle < PATIENCE:
+        source.returns.clear()
+        end = min(steps + ROUND, FRESH)
+        while steps < end:
+            taken = source.interact(model, int(model.source_steps))
+            model.train(round(taken * updates_per_step), model.batch_size)
+            steps += taken
+        # Where no episode ended there is nothing to judge by, and learning goes on.
+        earned = float(np.mean(source.returns)) if source.returns else math.inf
+        if model.verbose:
+            print(f"learning in the corrected simulator: {steps} source steps, mean return {earned:.5g}")
+        idle = 0 if earned > best else idle + 1
+        best = max(best, earned) if source.returns else best
     model.source_timesteps += steps

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +15,7 @@ import torch as th
 from sb3_rpto import RPTO
 from sb3_rpto.algorithms import closing
 from sb3_rpto.algorithms.closing import LoopCloser, outdated, stays_finite
+from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
@@ -45,14 +48,16 @@ def model(lacks: list[Effect], **kwargs: object) -> RPTO:
 @pytest.fixture
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closing, "FIRST", 80)
-    monkeypatch.setattr(closing, "FRESH", 50)
+    monkeypatch.setattr(closing, "FILL", 25)
+    monkeypatch.setattr(closing, "FRESH", 25)
 
 
 @cache
 def learned() -> RPTO:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(closing, "FIRST", 80)
-        patch.setattr(closing, "FRESH", 50)
+        patch.setattr(closing, "FILL", 25)
+        patch.setattr(closing, "FRESH", 25)
         return model(friction()).learn(100, source_timesteps=100)
 
 
@@ -80,8 +85,8 @@ def test_no_target_step_is_spent_on_tracing() -> None:
 
 def test_what_an_uncorrected_source_produced_is_dropped() -> None:
     made = learned()
-    # Since the trace at step 80 alone: the fresh steps, then four for each target step.
-    assert made.replay_buffer.source.size() < 50 + 4 + 4 * 21
+    # Since the trace at step 80 alone: the first and the fresh steps, then four for each target step.
+    assert made.replay_buffer.source.size() < 25 + 28 + 4 + 4 * 21
 
 
 def test_source_episodes_have_the_effect() -> None:
@@ -217,3 +222,47 @@ def test_weights_of_the_target_reach_the_fit() -> None:
     second = dynamics(again).fit(data, weights, max_steps=3)
     assert first["steps"] == second["steps"]
     np.testing.assert_allclose(dynamics(again).values, values, rtol=0.05)
+
+
+# --- learning in the corrected simulator ------------------------------------------------------------------------------
+
+
+class Scripted(EpisodeSource):
+    """A source whose rounds earn what is written; a round without a number ends no episode."""
+
+    def __init__(self, earns: list[float]) -> None:
+        self.returns = deque()
+        self.earns = iter(earns)
+
+    def interact(self, model: object, n_steps: int, random: bool = False) -> int:
+        self.returns.extend([r] if (r := next(self.earns, None)) is not None else [])
+        return n_steps
+
+
+@pytest.mark.parametrize(
+    ("earns", "rounds"),
+    [
+        ([3.0, 2.0, 1.0, 9.0], 3),  # two rounds in a row without a gain
+        ([1.0, 2.0, 1.5, 2.5, 2.0, 2.5, 9.0], 6),  # one of them alone does not end it, and as much is no gain
+        ([-9.0, -8.0, -7.0, -6.0, -5.0, -4.0, -3.0, -2.0], 8),  # to the last step
+        ([], 8),  # nothing to judge by
+    ],
+)
+def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
+    earns: list[float], rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(closing, "ROUND", 20)
+    monkeypatch.setattr(closing, "FRESH", 160)
+    updates: list[int] = []
+    made = SimpleNamespace(
+        _source_world=Scripted(earns),
+        gradient_steps=30,
+        source_steps=20,
+        batch_size=32,
+        source_timesteps=5,
+        verbose=0,
+        train=lambda n, batch_size: updates.append(n),
+    )
+    closing.learn_in_source(made)  # type: ignore[arg-type]
+    assert updates == [30] * rounds
+    assert made.source_timesteps == 5 + 20 * rounds
