@@ -5,13 +5,14 @@ from functools import cache
 import gymnasium as gym
 import numpy as np
 import pytest
+from simulated import compiled, problem, recorded
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_rpto.effects import Simulation, declare
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.tracing import Measurements, trace
-from sb3_rpto.tracing.concentrate import ENOUGH, concentrated
-from sb3_rpto.tracing.identify import Problem
+from sb3_rpto.tracing import Measurements, concentrate, trace
+from sb3_rpto.tracing.concentrate import ENOUGH, HOPS, WORTH, concentrated
+from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.windows import cut, discretised, noise_levels
 
@@ -98,3 +99,40 @@ def test_a_parameter_that_shows_nowhere_goes_back_to_where_it_may_show() -> None
     hidden = problem.score(problem.null * [0.5, 1.0])
     led = concentrated(problem, hidden, np.arange(2))
     assert led.values[0] >= problem.null[0]
+
+
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Costs of the fits that would be concentrated; none is."""
+    costs: list[float] = []
+
+    def seen(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
+        costs.append(fit.cost)
+        return fit
+
+    monkeypatch.setattr(concentrate, "concentrated", seen)
+    return costs
+
+
+def test_exact_data_that_still_err_are_fitted_anew_beside_the_best_until_that_does_not_pay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    costs = counted(monkeypatch)
+    monkeypatch.setattr(concentrate, "ENOUGH", 0.0)
+    problem = lengths().on(np.arange(0, 40, 4))
+    free = np.arange(len(TRUE))
+    led = concentrate.led_on(problem, problem.fit(problem.null, free, iterations=20), free)
+    best = np.minimum.accumulate(costs)
+    paid = np.array(costs[1:]) < WORTH * best[:-1]
+    assert led.cost == min(costs)
+    assert not paid[-HOPS:].any()
+    assert all(paid[k : k + HOPS].any() for k in range(len(paid) - HOPS))
+    assert concentrate.led_on(problem, problem.fit(problem.null, free, iterations=20), free).cost == led.cost
+
+
+def test_noisy_data_are_not_fitted_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    costs = counted(monkeypatch)
+    noisy = problem(declare(compiled(), ["pole.mass"]), recorded([], noise=1e-3), noise=1e-3)
+    far = noisy.score(2 * noisy.null)
+    assert far.errors.max() > ENOUGH
+    assert concentrate.led_on(noisy, far, np.arange(1)) is far
+    assert len(costs) == 1
