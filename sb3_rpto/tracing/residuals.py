@@ -220,7 +220,7 @@ def learnable_share(residuals: list[ForceResidual], seed: int, features: int = 2
     """Share of the force residual's variance that a small regressor predicts on unseen stretches, (nv,).
 
     Ridge regression on random tanh features of position, velocity, load and their recent past: the upper bound of
-    what a learned correction could still add. Zero when it predicts nothing.
+    what a learned correction could still add. Zero when it predicts nothing, or when too little is left to judge on.
 
     :param residuals: of all episodes
     :param seed: of the features
@@ -236,6 +236,8 @@ def learnable_share(residuals: list[ForceResidual], seed: int, features: int = 2
         half = np.arange(len(r.force) - lag) * 8 // max(1, len(r.force) - lag)
         fold.append((half + number) % 2)
     x, y, part = np.concatenate(inputs), np.concatenate(targets), np.concatenate(fold)
+    if len(np.unique(part)) < 2:
+        return np.zeros(y.shape[1])
     x = (x - x.mean(0)) / (x.std(0) + 1e-9)
     hidden = np.tanh(
         x @ rng.standard_normal((x.shape[1], features)) / np.sqrt(x.shape[1]) + rng.uniform(-1, 1, features)

@@ -171,6 +171,11 @@ def test_half_noise_is_half_learnable_joint_by_joint() -> None:
     assert share[1] < 0.03
 
 
+def test_too_few_samples_to_judge_on_have_no_learnable_share() -> None:
+    """A test run of an episode that ended at once leaves a sample or two."""
+    np.testing.assert_array_equal(learnable_share(made(lambda q, v, rng: -v, 1, 2), 0), 0)
+
+
 def test_learnable_share_of_nothing_is_zero_and_the_same_for_a_seed() -> None:
     np.testing.assert_array_equal(learnable_share(made(lambda q, v, rng: 0 * q), 0), 0)
     law = made(lambda q, v, rng: v**2)
