@@ -9,13 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
-from simulated import compiled, problem, recorded
+from simulated import RATE, compiled, problem, recorded, table
 
 from sb3_rpto.effects import Drive, Simulation, declare
+from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.effect import Effect, Parameter
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.effects.sensors import SensorBias
+from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.identify import RIDGE, TRUST, UNSTABLE, Loss, Problem, interpolate
 
@@ -462,3 +464,17 @@ def test_samples_that_do_not_count_count_nowhere() -> None:
     np.testing.assert_allclose(fit.values, TRUE, rtol=0.1)
     assert np.median(fit.errors) == pytest.approx(1.0, abs=0.1)
     assert np.median(masked.noise_errors(fit, 0)) == pytest.approx(1.0, abs=0.05)
+
+
+def test_sensors_that_are_all_late_look_like_commands_that_are_late() -> None:
+    """What they show at t is the motion at t - d, to which the commands of t - d belong."""
+    data, late = recorded(), 2
+    rows = [(e.qpos[:-late], e.qvel[:-late], e.ctrl[late:]) for e in data.episodes]
+    q, v, u = (np.stack(parts) for parts in zip(*rows))
+    time = data.episodes[0].time[late:]
+    shown = Measurements.from_tables({"runs": table(time, q, v, u, compiled())})
+    task = problem([CommandDelay("motor")], shown)
+    fit = task.fit(task.null, np.arange(1))
+    assert fit.values[0] == pytest.approx(late / RATE, rel=0.02)
+    assert np.median(fit.errors) < 1.1
+    assert np.median(task.score(task.null).errors) > 2
