@@ -6,7 +6,7 @@
 Targets differ from their source by numbers that are declared (lengths, masses, friction by up to 20 %), by these and
 an effect that nobody declared, or not at all; two fixed targets each. Compared are the source policy as it is, SAC
 fine-tuned in the target, RPTO with networks, RPTO with the simulator's numbers, and the same with the loop closed; an
-oracle that trained 100,000 steps in the target says what could be reached. Tables and manifest go to
+oracle that trained 100,000 steps in the target says what could be reached. Tables, figure and manifest go to
 examples/results/closed_loop.
 """
 
@@ -23,6 +23,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from sb3_rpto.experiments import closed_loop as study
+from sb3_rpto.experiments.plots import learning_curves
 
 
 def main() -> None:
@@ -78,8 +79,25 @@ def main() -> None:
         "python": platform.python_version(),
     }
     (out / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
+    draw(tables["summary"], oracles, out / "returns.png")
     print(tables["summary"].to_string(index=False))
     print(f"tables: {out}")
+
+
+def draw(summary: pd.DataFrame, oracles: dict[tuple[str, str, int], float], path: Path) -> None:
+    """Returns against target steps, a panel for each task and shift; the oracle's is the mean of its targets."""
+    lines = summary.rename(columns={"shift": "target", "method": "label", "iqm": "return"})
+    lines = lines.rename(columns={"low": "return_low", "high": "return_high"})
+    lines = lines[lines["label"] != "zero-shot"]
+    best = pd.Series(oracles, dtype=float)
+    places = best.groupby(level=[0, 1]).mean().items() if len(best) else ()
+    references = {f"{task}_{shift}": {"oracle": value} for (task, shift), value in places}
+    labels = [method for method in study.METHODS if (lines["label"] == method).any()]
+    figure = learning_curves(lines, references, labels, [m for m in labels if m.startswith("RPTO")], path)
+    for axis in figure.axes:
+        axis.set_xscale("symlog", linthresh=250)
+        axis.set_xlim(left=0)
+    figure.savefig(path, dpi=120)
 
 
 if __name__ == "__main__":
