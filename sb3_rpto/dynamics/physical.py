@@ -210,7 +210,9 @@ class PhysicalDynamics(Dynamics):
         rows = np.minimum(first[:, None] + np.arange(length), len(actions) - 1)
         commands = np.repeat(np.clip(actions[rows], *self._limits()), self.frame_skip, axis=1)
         qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
-        q, v = self.simulation.rollout(np.tile(self.values, (len(first), 1)), qpos, qvel, Drive(commands))
+        values = np.tile(self.values, (len(first), 1))
+        true_state(self.simulation, values, qpos, qvel)
+        q, v = self.simulation.rollout(values, qpos, qvel, Drive(commands))
         return bool(np.isfinite(q).all() and np.isfinite(v).all())
 
     def _limits(self) -> tuple[np.ndarray, np.ndarray]:

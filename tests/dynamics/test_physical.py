@@ -280,6 +280,17 @@ def test_a_biased_sensor_is_fitted():
     np.testing.assert_allclose(model.values, [7.0, 0.05], rtol=0.01)
 
 
+def test_a_trial_run_begins_at_the_true_state_not_at_what_a_biased_sensor_shows(monkeypatch):
+    data = collect(shifted(POLE, {}, [SensorBias("hinge", offset=0.05)]), 20)
+    model = dynamics(POLE, ["pole.mass"])
+    model.adopt([SensorBias("hinge", offset=0.05)])
+    begun, rollout = [], model.simulation.rollout
+    monkeypatch.setattr(model.simulation, "rollout", lambda *a: begun.append(a[1].copy()) or rollout(*a))
+    assert model.runs(data, np.array([3, 7]), 5)
+    shown = data.observations[[3, 7], 1].numpy()  # the hinge's angle
+    np.testing.assert_allclose(begun[0][:, 1], shown - 0.05, atol=1e-6)
+
+
 def test_adopt_keeps_the_values_of_what_it_is_not_told():
     model = dynamics(POLE)
     found = CommandDelay("slide", delay=0.03)
