@@ -202,6 +202,8 @@ def learn_in_source(model: TransferAlgorithm) -> None:
         source.returns.clear()
         end = min(steps + ROUND, FRESH)
         while steps < end:
+            if model.use_sde:
+                model.actor.reset_noise()
             taken = source.interact(model, int(model.source_steps))
             model.train(round(taken * updates_per_step), model.batch_size)
             steps += taken

@@ -254,7 +254,10 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
     monkeypatch.setattr(closing, "ROUND", 20)
     monkeypatch.setattr(closing, "FRESH", 160)
     updates: list[int] = []
+    noises: list[None] = []
     made = SimpleNamespace(
+        use_sde=True,
+        actor=SimpleNamespace(reset_noise=lambda: noises.append(None)),
         _source_world=Scripted(earns),
         gradient_steps=30,
         source_steps=20,
@@ -265,4 +268,5 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
     )
     closing.learn_in_source(made)  # type: ignore[arg-type]
     assert updates == [30] * rounds
+    assert len(noises) == rounds
     assert made.source_timesteps == 5 + 20 * rounds
