@@ -172,7 +172,7 @@ class Selector:
         return self._remembered(key, self.train.fit(values, self.free(key), begin.starts, iterations, tolerance=3e-3))
 
     def led_on(self, model: Model) -> Model:
-        """A model that errs more than it need, out of the kinks that may hold its fit: exact data can be met exactly."""
+        """A model that errs more than need be, out of kinks that may hold its fit; exact data can be met exactly."""
         exact = not len(self.train.moving)
         if not (exact or self.far(model)):
             return model
