@@ -118,6 +118,11 @@ class Selector:
         """Where adequacy is judged: the select windows, or all where there are none."""
         return self.select or self.train
 
+    @property
+    def exact(self) -> bool:
+        """Whether the windows' starts are known, as a simulator's are."""
+        return not len(self.train.moving)
+
     def free(self, effects: Sequence[int]) -> np.ndarray:
         """Indices of the parameters of the declared and of the given effects."""
         keep = [
@@ -173,8 +178,7 @@ class Selector:
 
     def led_on(self, model: Model) -> Model:
         """A model that errs more than need be, out of kinks that may hold its fit; exact data can be met exactly."""
-        exact = not len(self.train.moving)
-        if not (exact or self.far(model)):
+        if not (self.exact or self.far(model)):
             return model
         return self._remembered(model.effects, led_on(self.train, model.fit, self.free(model.effects)))
 
@@ -274,7 +278,7 @@ class Selector:
                     if self._simpler(other, best):
                         current, best = trial, other
             selection.alike[best] = sorted({e, *alike} - {best})
-        selection.model = current = self._simplest(current, selection, screening)
+        selection.model = current = self.simplest(current, selection, screening)
         selection.alike = {
             e: [i for i in found if i not in current.effects]
             for e, found in selection.alike.items()
@@ -308,7 +312,7 @@ class Selector:
         selection.model = current
         return selection
 
-    def _simplest(self, model: Model, selection: Selection, screening: Screening) -> Model:
+    def simplest(self, model: Model, selection: Selection, screening: Screening) -> Model:
         """Take the simpler ones of a class that do as well now that all else is right: richer ones win by trifles."""
         for e in model.effects:
             for other in sorted(screening.alike(e), key=lambda i: len(self.simulation.effects[i].parameters)):
@@ -317,6 +321,8 @@ class Selector:
                 self.say(f"{self.simulation.effects[other].label} is simpler")
                 begin = self._translated(model, e, other)
                 trial = self.model([i for i in model.effects if i != e] + [other], begin, REFIT + 3)
+                if self.exact and not self.far(model):
+                    trial = self.led_on(trial)
                 if not self._better(model, trial):
                     model = trial
                     selection.alike[other] = sorted({*selection.alike.pop(e, []), e} - {other})

@@ -9,7 +9,7 @@ from simulated import compiled, problem, recorded
 
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
-from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, ViscousFriction
+from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, StribeckFriction, ViscousFriction
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit
 from sb3_rpto.tracing.screen import screen
@@ -285,3 +285,23 @@ def test_a_fold_is_judged_as_by_a_fit_to_the_others() -> None:
     assert refit.mean() > 0
     assert s.evidence(full, s.model((1,), full.fit)).clear(THRESHOLD)
     assert not s.evidence(full, s.model((0,), full.fit)).clear(THRESHOLD)
+
+
+# --- exact data -------------------------------------------------------------------------------------------------------
+
+
+def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
+    """A Stribeck friction that has come near a Coulomb's path errs less than a Coulomb's first fit."""
+    effects: list[Effect] = [CoulombFriction("hinge"), StribeckFriction("hinge")]
+    data = recorded([CoulombFriction("hinge", level=0.08)], noise=0.0, exact=True)
+    s = Selector(problem(effects, data, noise=1e-5), None, THRESHOLD, lambda what: None)
+    assert s.exact
+    found = screen(s.train, s.model((), s.train.score(s.train.null)).fit)
+    assert found.alike(1) == [0]
+    rich = s.led_on(s.model([1], s.train.fit(s.train.null, s.free([1]))))
+    assert not s.far(rich)
+    assert s.simplest(rich, Selection(rich), found).effects == (0,)
+
+
+def test_noisy_data_are_not_exact() -> None:
+    assert not with_friction()[0].exact
