@@ -26,7 +26,7 @@ SECONDS = {
     "rto-physical": (90, 25),
     "rpto-ensemble": (115, 75),
     "rpto-physical": (150, 35),
-    "rpto-physical-closed": (450, 0),
+    "rpto-physical-closed": (800, 0),
     "sac": (15, 5),
     "sac-warm": (20, 5),
     "sac-warm-high": (60, 20),

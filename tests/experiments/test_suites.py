@@ -65,8 +65,8 @@ def test_quick_has_every_method_on_two_tasks() -> None:
     assert QUICK.episodes == 10
 
 
-def test_quick_is_planned_to_take_about_ninety_minutes_on_two_cores() -> None:
-    assert 60 < sum(job.seconds for job in jobs(QUICK)) / 2 / 60 < 100
+def test_quick_is_planned_to_take_less_than_two_hours_on_two_cores() -> None:
+    assert 60 < sum(job.seconds for job in jobs(QUICK)) / 2 / 60 < 110
 
 
 def test_paper_is_five_tasks_four_targets_four_seeds_all_methods() -> None:
