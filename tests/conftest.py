@@ -6,6 +6,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import gymnasium as gym
 import pytest
 import torch as th
+from hypothesis import settings
 
 from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms import warm
@@ -13,6 +14,9 @@ from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Report, trace
 
 th.set_num_threads(1)
+# Machines may be busy: no test is timed.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 ALGORITHMS = [RPO, RTO, RPTO]
 SMALL_POLICY = {"net_arch": [16]}
