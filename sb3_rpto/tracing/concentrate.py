@@ -33,7 +33,7 @@ def led_on(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     :return: never of a higher cost than ``fit``
     """
     fit, failed, rng = concentrated(problem, fit, free), 0, np.random.default_rng(0)
-    while len(free) and not len(problem.moving) and fit.errors.max() > ENOUGH and failed < HOPS:
+    while len(free) and problem.exact and fit.errors.max() > ENOUGH and failed < HOPS:
         hop = 10 ** rng.uniform(*FAR_AND_NEAR) * rng.standard_normal(len(free))
         beside = fit.values.copy()
         beside[free] = np.clip(beside[free] + hop * problem.size[free], problem.lower[free], problem.upper[free])

@@ -106,6 +106,7 @@ class Problem:
         self.null = simulation.null
         self.declared = np.array([e.kind == "declared" for e in simulation.effects for _ in e.parameters], dtype=bool)
         self.moving = np.flatnonzero((windows.spread > 0).any(axis=0))  # coordinates of the start that are free
+        self.exact = not len(self.moving)  # as a simulator's data are
         self.sensors = [(e, s) for e, s in zip(simulation.effects, simulation.slices) if e.overrides("observe")]
 
     def on(self, index: np.ndarray) -> Problem:

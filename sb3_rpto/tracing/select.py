@@ -118,11 +118,6 @@ class Selector:
         """Where adequacy is judged: the select windows, or all where there are none."""
         return self.select or self.train
 
-    @property
-    def exact(self) -> bool:
-        """Whether the windows' starts are known, as a simulator's are."""
-        return not len(self.train.moving)
-
     def free(self, effects: Sequence[int]) -> np.ndarray:
         """Indices of the parameters of the declared and of the given effects."""
         keep = [
@@ -178,7 +173,7 @@ class Selector:
 
     def led_on(self, model: Model) -> Model:
         """A model that errs more than need be, out of kinks that may hold its fit; exact data can be met exactly."""
-        if not (self.exact or self.far(model)):
+        if not (self.train.exact or self.far(model)):
             return model
         return self._remembered(model.effects, led_on(self.train, model.fit, self.free(model.effects)))
 
@@ -321,7 +316,7 @@ class Selector:
                 self.say(f"{self.simulation.effects[other].label} is simpler")
                 begin = self._translated(model, e, other)
                 trial = self.model([i for i in model.effects if i != e] + [other], begin, REFIT + 3)
-                if self.exact and not self.far(model):
+                if self.train.exact and not self.far(model):
                     trial = self.led_on(trial)
                 if not self._better(model, trial):
                     model = trial

@@ -223,7 +223,7 @@ def search(selector: Selector, rough: Selector, base: Model, screening: Screenin
     say(0.7, "trying like effects in their place")
     selection = rough.merge(rough.substitute(selection, screening), screening)
     selection.model = selector.led_on(selector.model(selection.model.effects, selection.model.fit, iterations=10))
-    if selector.exact:  # only now are the fits good enough to tell
+    if selector.train.exact:  # only now are the fits good enough to tell
         selection.model = selector.simplest(selection.model, selection, screening)
     return selector.judge(selection)
 

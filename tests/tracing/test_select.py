@@ -295,7 +295,7 @@ def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
     effects: list[Effect] = [CoulombFriction("hinge"), StribeckFriction("hinge")]
     data = recorded([CoulombFriction("hinge", level=0.08)], noise=0.0, exact=True)
     s = Selector(problem(effects, data, noise=1e-5), None, THRESHOLD, lambda what: None)
-    assert s.exact
+    assert s.train.exact
     found = screen(s.train, s.model((), s.train.score(s.train.null)).fit)
     assert found.alike(1) == [0]
     rich = s.led_on(s.model([1], s.train.fit(s.train.null, s.free([1]))))
@@ -304,4 +304,4 @@ def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
 
 
 def test_noisy_data_are_not_exact() -> None:
-    assert not with_friction()[0].exact
+    assert not with_friction()[0].train.exact
