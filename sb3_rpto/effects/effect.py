@@ -66,8 +66,8 @@ class Effect:
 
     A subclass states ``kind``, ``place``, ``parameters`` and ``equation`` and overrides one hook: :meth:`write` (a
     field of the model), :meth:`act` (a force or dry friction in every substep), :meth:`command` (on the signal
-    before the actuators) or :meth:`observe` (on the sensors). Each hook works on ``n`` simulations at once;
-    ``x`` is (n, p), the parameters of each. ``act`` and ``command`` need no more than NumPy.
+    before the actuators), :meth:`observe` or :meth:`late` (on the sensors). Each hook works on ``n`` simulations at
+    once; ``x`` is (n, p), the parameters of each. ``act`` and ``command`` need no more than NumPy.
 
     :param on: name of the object it sits on, as in the MJCF; none for ``place = "world"``
     :param values: parameters by name; those not given are at their null value
@@ -157,6 +157,18 @@ class Effect:
     def unobserve(self, q: np.ndarray, v: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The inverse of :meth:`observe`."""
         return q, v
+
+    def late(self, x: np.ndarray) -> np.ndarray:
+        """How old in s, (...,) of ``x`` (..., p), what the joint's sensor shows is: position and velocity of then.
+
+        Another effect's :meth:`observe` on the same joint acts on what is shown late.
+        """
+        return np.zeros(x.shape[:-1])
+
+    @property
+    def senses(self) -> bool:
+        """Whether the effect is on a sensor."""
+        return self.overrides("observe") or self.overrides("late")
 
     def overrides(self, hook: str) -> bool:
         """Whether the effect acts by ``hook``."""

@@ -19,7 +19,7 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = ()) -> list[Effec
     =====================================================  ==========================================================
     hinge or slide                                         coulomb_friction, stribeck_friction, viscous_friction,
                                                            quadratic_drag, asymmetric_damping, torque_offset, spring,
-                                                           armature, sensor_bias, sensor_gain
+                                                           armature, sensor_delay, sensor_bias, sensor_gain
     hinge only                                             torque_ripple, position_friction
     hinge or slide with a motor                            load_friction, directional_load_friction
     actuator                                               command_delay, command_deadband, command_gain,

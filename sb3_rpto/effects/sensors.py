@@ -12,6 +12,54 @@ def _along(x: np.ndarray, q: np.ndarray) -> np.ndarray:
     return x.reshape(x.shape + (1,) * (q.ndim - x.ndim))
 
 
+def ago(steps: np.ndarray, q: np.ndarray, v: np.ndarray) -> Pair:
+    """Position and velocity of a joint some time ago, between two steps in a straight line; at most at the first.
+
+    :param steps: how long ago, (n,)
+    :param q: positions of K + 1 steps, the newest last, (n, K + 1)
+    :param v: velocities, likewise
+    :return: (n,) each
+    """
+    last = q.shape[1] - 1
+    at = np.maximum(last - steps, 0.0)
+    k = at.astype(int)
+    rows, part, after = np.arange(len(q)), at - k, np.minimum(k + 1, last)
+    return (1 - part) * q[rows, k] + part * q[rows, after], (1 - part) * v[rows, k] + part * v[rows, after]
+
+
+def carry_on(effect: Effect, x: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, qacc: np.ndarray) -> None:
+    """Move, in place, the joint of a late sensor from the state that it shows to the present one, to second order.
+
+    :param effect: on the sensor
+    :param x: its parameters, (n, p)
+    :param qpos: (n, nq), of then
+    :param qvel: (n, nv), likewise
+    :param qacc: (n, nv), likewise
+    """
+    age, v, a = effect.late(x), qvel[:, effect.dof], qacc[:, effect.dof]
+    qpos[:, effect.adr] += age * (v + 0.5 * age * a)
+    qvel[:, effect.dof] += age * a
+
+
+@register
+class SensorDelay(Effect):
+    r"""A sensor that is late, by its bus or its filter: it shows :math:`q(t - d)` and :math:`\dot q(t - d)`.
+
+    Before an episode has lasted so long, it shows the first state. Where all sensors are as late as each other, the
+    recordings are those of late commands.
+    """
+
+    kind = "sensor_delay"
+    place = "sensor"
+    parameters = (Parameter("delay", "s", 0.005, lower=0.0, upper=0.1),)
+    equation = "q_shown = q(t - delay)"
+    excite = "fast motion, and more than one joint: else it is a late command"
+
+    def late(self, x: np.ndarray) -> np.ndarray:
+        """The delay."""
+        return x[..., 0]
+
+
 @register
 class SensorBias(Effect):
     """An encoder whose zero is wrong: it shows :math:`q + b`; the speed is right."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -13,6 +14,7 @@ from gymnasium.utils import EzPickle, RecordConstructorArgs
 
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.sensors import ago
 from sb3_rpto.effects.simulation import Active, prepare, push
 from sb3_rpto.effects.world import LiveWorld
 
@@ -63,7 +65,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
     """
 
     #: what changes after it is made, for :func:`sb3_rpto.envs.state.save_state`
-    state_attributes: ClassVar[tuple[str, ...]] = ("_memory",)
+    state_attributes: ClassVar[tuple[str, ...]] = ("_memory", "_past")
 
     def __init__(self, env: gym.Env, effects: Sequence[Effect]) -> None:
         RecordConstructorArgs.__init__(self, effects=effects)
@@ -74,6 +76,8 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         self._commanding: list[tuple[Effect, np.ndarray]] = []
         self._memory: list[dict[str, Any]] = []
         self._sensing: list[tuple[Effect, np.ndarray]] = []
+        # States of the last substeps, the newest last: what late sensors show.
+        self._past: list[tuple[np.ndarray, np.ndarray]] = []
         self._acting: list[tuple[Effect, np.ndarray]] = []
         beneath = corrections(env)
         self._covered = False
@@ -96,7 +100,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         if self._covered:
             raise ValueError("other effects came on top of these; set those, or begin from an environment without")
         base: Any = self.unwrapped
-        sensing = [effect.label for effect, _ in active(own(effects, base.model)) if effect.overrides("observe")]
+        sensing = [effect.label for effect, _ in active(own(effects, base.model)) if effect.senses]
         if sensing and not callable(getattr(base, "_get_obs", None)):
             raise ValueError(f"{', '.join(sensing)}: {type(base).__name__} has no _get_obs(); read its sensors there")
         self._world.restore()
@@ -108,12 +112,12 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         memories = {effect.label: memory for (effect, _), memory in zip(self._commanding, self._memory)}
         self._acting = [pair for pair in found if pair[0].overrides("act")]
         self._commanding = sorted((p for p in found if p[0].overrides("command")), key=lambda pair: pair[0].order)
-        self._sensing = [pair for pair in found if pair[0].overrides("observe")]
+        self._sensing = [pair for pair in found if pair[0].senses]
         self._memory = [memories.get(effect.label, {}) for effect, _ in self._commanding]
         stack = corrections(self)
         self._wanted = set()
         for seam, answer, wanted in (
-            (self._seam, self._simulate, any(layer._acting or layer._commanding for layer in stack)),
+            (self._seam, self._simulate, any(layer._acting or layer._commanding or layer._latest() for layer in stack)),
             ("_get_obs", self._observe, any(layer._sensing for layer in stack)),
         ):
             vars(base).pop(seam, None)
@@ -128,7 +132,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; commands from before it are forgotten."""
-        self._memory = [{} for _ in self._commanding]
+        self._memory, self._past = [{} for _ in self._commanding], []
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -161,6 +165,9 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
                 world.rough(effect.dof)
         world.settle()
         command, dt = np.array(ctrl, dtype=float), model.opt.timestep
+        kept = math.ceil(max(layer._latest() for layer in stack) / dt) + 1
+        if kept > 1 and not self._past:
+            self._past = [(data.qpos.copy(), data.qvel.copy())]
         for _ in range(n_frames):
             sent = command.copy()
             for effect, x, memory in commanding:
@@ -169,6 +176,8 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             if acting:
                 push(world, acting)
             mujoco.mj_step(model, data)
+            if kept > 1:
+                self._past = [*self._past[1 - kept :], (data.qpos.copy(), data.qvel.copy())]
         if acting:
             # What a later set_state computes must not depend on the substep before it.
             world.restore()
@@ -181,7 +190,14 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         base: Any = self.unwrapped
         data = base.data
         qpos, qvel = data.qpos.copy(), data.qvel.copy()
-        for effect, x in (pair for layer in reversed(corrections(self)) for pair in layer._sensing):
+        sensing = [pair for layer in reversed(corrections(self)) for pair in layer._sensing]
+        for effect, x in sensing:
+            steps = effect.late(x) / base.model.opt.timestep
+            if steps.any() and self._past:
+                q = np.array([[q[effect.adr] for q, _ in self._past]])
+                v = np.array([[v[effect.dof] for _, v in self._past]])
+                (data.qpos[effect.adr],), (data.qvel[effect.dof],) = ago(steps, q, v)
+        for effect, x in sensing:
             q, v = effect.observe(np.array([data.qpos[effect.adr]]), np.array([data.qvel[effect.dof]]), x)
             data.qpos[effect.adr], data.qvel[effect.dof] = q[0], v[0]
         try:
@@ -189,6 +205,10 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             return copy.deepcopy(type(base)._get_obs(base, *args, **kwargs))
         finally:
             data.qpos[:], data.qvel[:] = qpos, qvel
+
+    def _latest(self) -> float:
+        """The longest delay of these effects' sensors in s."""
+        return max((float(effect.late(x)[0]) for effect, x in self._sensing), default=0.0)
 
     def __getstate__(self) -> dict[str, Any]:
         """As gymnasium's own pickling of MuJoCo tasks: what makes a new one, without the state of the simulation."""

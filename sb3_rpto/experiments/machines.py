@@ -24,7 +24,7 @@ XL330_ERROR_GAIN = (4096 / (2 * np.pi)) / (256 * 885)
 XL330_STALL_TORQUE = 0.4
 """Nominal kt·vin/R in N·m; a start for the fit, not a measurement."""
 XL330_DAMPING = 0.03
-"""Nominal kt²/R + b in N·m·s/rad; a start for the fit, not a measurement."""
+"""Nominal kt²/R in N·m·s/rad; a start for the fit, not a measurement."""
 
 _OPTION = f"""<option timestep="0.002" integrator="implicitfast" gravity="0 0 -{GRAVITY}">
     <flag contact="disable"/>
@@ -127,10 +127,10 @@ def double_pendulum(folder: str | os.PathLike[str]) -> Machine:
 def servo_xl330(folder: str | os.PathLike[str]) -> Machine:
     """Hobby servo that holds a load of 0.49 kg at 0.10 m: a pendulum and a DC motor under proportional control.
 
-    The torque is (kt·vin/R)·clip(kp·e·(goal - q), -1, 1) - (kt²/R + b)·qd with e the :data:`XL330_ERROR_GAIN`; both
-    terms act only while the servo is enabled. The firmware's gain kp differs by run, so ``param.servo.kp`` carries each
-    run's gain at nominal strength in N·m/rad. The servo's own speed lags its position by about 20 ms and is left out:
-    what :class:`Measurements` estimates from the position is better.
+    The torque is (kt·vin/R)·clip(kp·e·(goal - q), -1, 1) - (kt²/R)·qd while the servo is enabled, with e the
+    :data:`XL330_ERROR_GAIN`, and -b·qd always: where the arm falls freely, b alone brakes it. The firmware's gain kp
+    differs by run, so ``param.servo.kp`` carries each run's gain at nominal strength in N·m/rad. The servo's own speed
+    lags its position by about 20 ms and is left out: what :class:`Measurements` estimates from the position is better.
 
     :param folder: as found by :func:`find_measured`
     :raises FileNotFoundError: no recording is there
@@ -142,7 +142,7 @@ def servo_xl330(folder: str | os.PathLike[str]) -> Machine:
         name="servo_xl330",
         xml=_servo_xml(mass=0.49, length=0.10, gain=_servo_gain(400)),
         data=Measurements.from_tables(dict(map(_servo_run, paths))),
-        declared=("servo.strength", "servo.damping"),
+        declared=("servo.strength", "servo.damping", "hinge.damping"),
         other=None,
         licence="Apache-2.0",
         source="github.com/Rhoban/bam, commit af226042",

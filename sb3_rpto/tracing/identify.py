@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
+from sb3_rpto.effects.sensors import carry_on
 from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.windows import Windows
 
@@ -107,7 +108,7 @@ class Problem:
         self.declared = np.array([e.kind == "declared" for e in simulation.effects for _ in e.parameters], dtype=bool)
         self.moving = np.flatnonzero((windows.spread > 0).any(axis=0))  # coordinates of the start that are free
         self.exact = not len(self.moving)  # as a simulator's data are
-        self.sensors = [(e, s) for e, s in zip(simulation.effects, simulation.slices) if e.overrides("observe")]
+        self.sensors = [(e, s) for e, s in zip(simulation.effects, simulation.slices) if e.senses]
 
     def on(self, index: np.ndarray) -> Problem:
         """The same problem on the windows at ``index``."""
@@ -137,8 +138,15 @@ class Problem:
             qpos[:, effect.adr], qvel[:, effect.dof] = effect.unobserve(
                 qpos[:, effect.adr], qvel[:, effect.dof], values[:, s]
             )
+            carry_on(effect, values[:, s], qpos, qvel, w.qacc[index])
         q, v = self.simulation.rollout(values, qpos, qvel, w.drive.take(index))
-        out = interpolate(q, v, w.at[index], float(model.opt.timestep), w.columns, self._dofs())
+        dt, dofs = float(model.opt.timestep), self._dofs()
+        out = interpolate(q, v, w.at[index], dt, w.columns, dofs)
+        for effect, s in self.sensors:
+            age = effect.late(values[:, s])
+            for column in np.flatnonzero(w.columns == effect.adr) if age.any() else ():
+                at = w.at[index] - age[:, None] / dt
+                out[:, :, [column]] = interpolate(q, v, at, dt, w.columns[[column]], dofs[[column]])
         for effect, s in self.sensors:
             for column in np.flatnonzero(w.columns == effect.adr):
                 out[:, :, column] = effect.observe(out[:, :, column], out[:, :, column], values[:, None, s])[0]
@@ -407,7 +415,7 @@ class _Step:
 def interpolate(
     q: np.ndarray, v: np.ndarray, at: np.ndarray, dt: float, columns: np.ndarray, dofs: np.ndarray
 ) -> np.ndarray:
-    """Positions at fractional steps by cubic Hermite interpolation, (n, S, m).
+    """Positions at fractional steps by cubic Hermite interpolation, before the start in a straight line, (n, S, m).
 
     :param q: (n, K + 1, nq)
     :param v: (n, K + 1, nv)
@@ -416,6 +424,10 @@ def interpolate(
     :param columns: addresses in q, (m,)
     :param dofs: addresses in v, -1 for a coordinate that is interpolated linearly, (m,)
     """
+    past, at = np.minimum(at, 0.0), np.maximum(at, 0.0)
+    if past.any():
+        straight = np.where(dofs >= 0, dt * v[:, 0][:, dofs], 0.0)[:, None]
+        return interpolate(q, v, at, dt, columns, dofs) + past[:, :, None] * straight
     k = np.minimum(at.astype(int), q.shape[1] - 2)
     s = (at - k)[:, :, None]
     rows = np.arange(len(q))[:, None]

@@ -35,6 +35,9 @@ OVERLAP = 2 / 3
 SHORT = 15.0
 #: Fewer windows than this overlap.
 FEW = 40
+#: Where what is found leaves errors far above the noise, windows so many times as long show more of what is missing,
+#: and what only stands in for it shows too.
+LONGER = 2
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
 
@@ -65,7 +68,8 @@ def trace(
     :param declared: parameters of the model that may be fitted, as :func:`sb3_rpto.effects.declare` takes them
     :param seed: of the split, the starts and the resampling
     :param candidates: kinds of effects to look for; default: all registered ones
-    :param horizon: length of the windows in s; default: 0.5, shorter for short episodes
+    :param horizon: length of the windows in s; default: 0.5, shorter for short episodes, and twice that to go on with
+        where what was found leaves errors far above the noise
     :param calibrate: recalibrate the threshold of selection on so many sets simulated from the fitted declared model
     :param threads: that simulate; 0: one for each core
     :param progress: called with the share done and what is being done
@@ -79,43 +83,52 @@ def trace(
     findings += [f for f in train.findings if f not in findings]
     fitted = replace(data, episodes=train.episodes + select.episodes)
     sigma = noise_levels(fitted)
-    horizon = horizon or _horizon(fitted)
     nominal = discretised(compiled, data, fine=True)
     known = declare(nominal, declared)
     effects: list[Effect] = [*known, *_candidates(nominal, [d.label for d in known], candidates)]
     simulation = Simulation(nominal, effects, threads)
     scales = typical(simulation, force_residuals(simulation, simulation.null, fitted)).scales(effects)
-    windows = _windows(nominal, train, select, sigma, horizon)
-    if windows[1] is None:
-        message = f"selected on {len(windows[0])} windows of the training runs by cross-validation over blocks"
+    coarse = Simulation(discretised(compiled, data, fine=False), effects, threads)
+
+    def selectors(length: float) -> tuple[Selector, Selector]:
+        """On windows of this length: one that integrates finely, one as the model does."""
+        fine, rough = (_windows(s.model, train, select, sigma, length) for s in (simulation, coarse))
+        return Selector.on(simulation, fine, scales, length, say), Selector.on(coarse, rough, scales, length, say)
+
+    length = _horizon(fitted) if horizon is None else horizon
+    selector, rough = selectors(length)
+    if selector.select is None:
+        count = len(selector.train.windows)
+        message = f"selected on {count} windows of the training runs by cross-validation over blocks"
         findings.append(Finding("split", "training runs", message))
-    selector = Selector.on(simulation, windows, scales, horizon, say)
-    coarse = discretised(compiled, data, fine=False)
-    rough = Selector.on(
-        Simulation(coarse, effects, threads), _windows(coarse, train, select, sigma, horizon), scales, horizon, say
-    )
-    judging = selector.judging
 
     say(0.05, "fitting the declared parameters")
     base = selector.model((), fit_declared(rough, seed), iterations=10)
-    before = base.fit
-    first = adequacy(judging, judging.score(before.values), seed)
+    first = judged(selector, base, seed)
     screening: Screening | None = None
     selection = Selection(base)
-    last = first
     if not first.adequate:
         say(0.15, "screening the candidates")
-        screening = screen(selector.train, before)
+        screening = screen(selector.train, base.fit)
         if calibrate:
             say(0.2, f"calibrating on {calibrate} complete sets")
             t = calibrated(rough, rough.model((), base.fit).fit, worth_fitting(selector, screening), calibrate, seed)
             selector.threshold = rough.threshold = t
         selection = search(selector, rough, base, screening, say)
-        last = adequacy(judging, judging.score(selection.model.fit.values), seed)
+        if horizon is None and selector.far(selection.model) and _holds(fitted, LONGER * length):
+            say(0.75, "looking at longer windows")
+            longer = selectors(LONGER * length)
+            found = search_on(*longer, selection, worth_fitting(selector, screening), screening, say)
+            if found.model.effects:
+                selector, selection = longer[0], found
+                base = selector.model((), selector.train.score(base.fit.values), iterations=10)
+                first = judged(selector, base, seed)
+    last = judged(selector, selection.model, seed)
+    before = base.fit
 
     say(0.85, "fitting the final model")
-    joined = windows[0] if windows[1] is None else join(windows[0], windows[1])
-    problem = Problem(simulation, joined, scales)
+    parts = [p.windows for p in (selector.train, selector.select) if p is not None]
+    problem = Problem(simulation, parts[0] if len(parts) == 1 else join(*parts), scales)
     final, intervals = refit(selection, problem, seed)
     # Both models are fitted to the same data before they are compared on the test runs.
     before = problem.fit(before.values, selector.free(()), iterations=10)
@@ -146,7 +159,7 @@ def trace(
             for name, part in (("train", train), ("select", select), ("test", test))
         },
         threshold=selector.limit(selection.model)[0],
-        horizon=horizon,
+        horizon=selector.horizon,
         seed=seed,
         # An environment may hold other numbers than its file, which the specification would lose.
         source=model if spec is None or isinstance(model, gym.Env) else spec,
@@ -219,6 +232,23 @@ def search(selector: Selector, rough: Selector, base: Model, screening: Screenin
     else:
         # What seems to matter stays while much else may still be wrong.
         selection = rough.look_forward(rough.eliminate(Selection(joint), SEEMS), chosen)
+    return settle(selector, rough, selection, screening, say)
+
+
+def search_on(
+    selector: Selector, rough: Selector, found: Selection, chosen: Sequence[int], screening: Screening, say: Progress
+) -> Selection:
+    """Go on from what was found with other windows: what is missing is added, what is not needed goes.
+
+    Arguments as in :func:`search`, with all excited candidates.
+    """
+    begin = rough.model(found.model.effects, rough.train.score(found.model.fit.values), iterations=10)
+    selection = rough.look_forward(Selection(begin, dropped=dict(found.dropped)), chosen)
+    return settle(selector, rough, selection, screening, say)
+
+
+def settle(selector: Selector, rough: Selector, selection: Selection, screening: Screening, say: Progress) -> Selection:
+    """Elimination to what is clearly needed, substitution by like effects, and the evidence for what remains."""
     selection = rough.eliminate(selection)
     say(0.7, "trying like effects in their place")
     selection = rough.merge(rough.substitute(selection, screening), screening)
@@ -226,6 +256,11 @@ def search(selector: Selector, rough: Selector, base: Model, screening: Screenin
     if selector.train.exact:  # only now are the fits good enough to tell
         selection.model = selector.simplest(selection.model, selection, screening)
     return selector.judge(selection)
+
+
+def judged(selector: Selector, model: Model, seed: int) -> Adequacy:
+    """How a model's errors compare with those of the noise alone, on the windows to judge."""
+    return adequacy(selector.judging, selector.judging.score(model.fit.values), seed)
 
 
 def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 200) -> tuple[np.ndarray, np.ndarray]:
@@ -278,7 +313,7 @@ def join(a: Windows, b: Windows) -> Windows:
     return replace(
         a,
         drive=drive,
-        **{n: both(n) for n in ("qpos", "qvel", "spread", "time")},
+        **{n: both(n) for n in ("qpos", "qvel", "qacc", "spread", "time")},
         **{n: np.concatenate([pad(getattr(w, n)) for w in (a, b)]) for n in ("at", "measured", "usable")},
         block=np.concatenate([a.block, b.block + a.block.max() + 1]),
         episode=np.concatenate([a.episode, b.episode + a.episode.max() + 1]),
@@ -318,6 +353,11 @@ def _horizon(data: Measurements) -> float:
     lengths = [float(e.time[-1] - e.time[0]) for e in data.episodes]
     usual = 0.5 if sum(lengths) >= SHORT else 0.8
     return min(max(usual, 8 * step), max(max(lengths) / 3, 3 * step))
+
+
+def _holds(data: Measurements, length: float) -> bool:
+    """Whether the data hold enough windows of this length in s to select on."""
+    return sum(int((e.time[-1] - e.time[0]) / length) for e in data.episodes) >= FEW // 2
 
 
 def _windows(

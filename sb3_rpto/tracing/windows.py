@@ -34,6 +34,7 @@ class Windows:
 
     :param qpos: smoothed positions at the start, as the sensors show them, (W, nq)
     :param qvel: smoothed velocities there, (W, nv)
+    :param qacc: and accelerations, which late sensors need, (W, nv)
     :param spread: standard deviation of that start, positions then velocities, (W, 2 nv); zeros for exact data
     :param drive: commands on the grid of the time step
     :param at: samples on that grid, in steps from the start, (W, S); fractional where the clock jitters
@@ -48,6 +49,7 @@ class Windows:
 
     qpos: np.ndarray
     qvel: np.ndarray
+    qacc: np.ndarray
     spread: np.ndarray
     drive: Drive
     at: np.ndarray
@@ -119,13 +121,13 @@ def half_step(model: mujoco.MjModel) -> float:
 
 def smoothed_state(
     episode: Episode, index: int, sigma: np.ndarray, lead: float = 0.0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position and velocity of the scalar columns at a sample by a local cubic in time, and their spread.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Position, velocity and acceleration of the scalar columns at a sample by a local cubic in time, and the spread.
 
     :param index: of the sample
     :param sigma: noise of the position columns, (m,)
     :param lead: velocities are those of so many s before the sample
-    :return: positions (m,), velocities (m,), standard deviations of both (2, m)
+    :return: positions (m,), velocities (m,), accelerations (m,), standard deviations of the first two (2, m)
     """
     step = float(np.median(np.diff(episode.time)))
     half = max(HALF_COUNT, round(HALF_WIDTH / step))
@@ -138,7 +140,8 @@ def smoothed_state(
     spread = np.sqrt(np.sum(inverse[:2] ** 2, axis=1))[:, None] * sigma
     z = -lead / scale
     velocity = (coefficients[1] + 2 * z * coefficients[2] + 3 * z**2 * coefficients[3]) / scale
-    return coefficients[0], velocity, spread / np.array([[1.0], [scale]])
+    acceleration = (2 * coefficients[2] + 6 * z * coefficients[3]) / scale**2
+    return coefficients[0], velocity, acceleration, spread / np.array([[1.0], [scale]])
 
 
 def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco.MjModel:
@@ -209,7 +212,7 @@ def _build(
     observed = [i for i, name in enumerate(data.columns.qpos) if name not in data.unobserved]
     addresses = names_of(model, data.columns.qpos)
     actuators = command_order(model, data)
-    qpos, qvel = np.tile(model.qpos0, (count, 1)), np.zeros((count, model.nv))
+    qpos, qvel, qacc = np.tile(model.qpos0, (count, 1)), *np.zeros((2, count, model.nv))
     spread = np.zeros((count, 2 * model.nv))
     commands = np.zeros((count, before + steps, model.nu))
     enabled = np.ones((count, steps, model.nu))
@@ -220,7 +223,7 @@ def _build(
     for w, (number, begin, end) in enumerate(starts):
         e = data.episodes[number]
         t0 = e.time[begin]
-        qpos[w], qvel[w], spread[w] = start_state(model, data, e, begin, sigma, addresses)
+        qpos[w], qvel[w], qacc[w], spread[w] = start_state(model, data, e, begin, sigma, addresses)
         grid = t0 + h * np.arange(-before, steps)
         row = np.clip(np.searchsorted(e.time, grid + 1e-6 * h, side="right") - 1, 0, len(e) - 1)
         commands[w][:, actuators] = (
@@ -244,6 +247,7 @@ def _build(
     return Windows(
         qpos,
         qvel,
+        qacc,
         spread,
         drive,
         at,
@@ -275,15 +279,18 @@ def held(time: np.ndarray, ctrl: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 def start_state(
     model: mujoco.MjModel, data: Measurements, episode: Episode, index: int, sigma: np.ndarray, addresses: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The state of the model at a sample: qpos (nq,), qvel (nv,), spread (2 nv,)."""
-    qpos, qvel, spread = model.qpos0.copy(), np.zeros(model.nv), np.zeros(2 * model.nv)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The state of the model at a sample: qpos (nq,), qvel (nv,), qacc (nv,), spread (2 nv,)."""
+    qpos, (qvel, qacc), spread = model.qpos0.copy(), np.zeros((2, model.nv)), np.zeros(2 * model.nv)
     dofs = velocity_addresses(model, data)
     if data.exact:
         qpos[addresses] = episode.qpos[index]
         qvel[dofs] = episode.qvel[index]
-        return qpos, qvel, spread
-    position, velocity, deviation = smoothed_state(episode, index, sigma, half_step(model))
+        if index + 1 < len(episode):
+            after = episode.qvel[index + 1] - episode.qvel[index]
+            qacc[dofs] = after / (episode.time[index + 1] - episode.time[index])
+        return qpos, qvel, qacc, spread
+    position, velocity, acceleration, deviation = smoothed_state(episode, index, sigma, half_step(model))
     qpos[addresses] = position
     scalar = {int(model.jnt_qposadr[j]): int(model.jnt_dofadr[j]) for j in scalar_joints(model)}
     if len(scalar) < model.njnt:
@@ -291,9 +298,9 @@ def start_state(
     for i, address in enumerate(addresses):
         if int(address) in scalar:
             dof = scalar[int(address)]
-            qvel[dof] = velocity[i]
+            qvel[dof], qacc[dof] = velocity[i], acceleration[i]
             spread[[dof, model.nv + dof]] = deviation[:, i]
-    return qpos, qvel, spread
+    return qpos, qvel, qacc, spread
 
 
 def scalar_joints(model: mujoco.MjModel) -> list[int]:

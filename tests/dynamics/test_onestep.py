@@ -10,7 +10,7 @@ from sb3_rpto.dynamics.onestep import BLOWN, OneStep, as_steps
 from sb3_rpto.effects import Simulation, declare
 from sb3_rpto.effects.commands import ActuatorLag, CommandDelay
 from sb3_rpto.effects.friction import StribeckFriction
-from sb3_rpto.effects.sensors import SensorBias, SensorGain
+from sb3_rpto.effects.sensors import SensorBias, SensorDelay, SensorGain
 from sb3_rpto.envs.observations import state_map
 
 
@@ -69,6 +69,16 @@ def test_true_effects_reach_what_the_target_reached(effects):
     tolerance = 1e-9 if effects[0].kind != "actuator_lag" else 1e-6  # which remembers all, and the steps 0.2 s
     assert missed(steps, sim, truth) < tolerance
     assert missed(steps, sim, sim.null) > 1e-3
+
+
+def test_a_late_sensor_is_carried_on_to_the_present():
+    """To second order, by the speed it gained: the other joint, which it drives, then moves as it did."""
+    late = [SensorDelay("hinge2", delay=0.01)]
+    steps, sim = steps_of(collect(shifted(POLES, {}, late), 60, scale=0.3), POLES), simulation(POLES, [], late)
+    reached = steps.reach(sim, np.array([[0.0], [0.005], [0.01], [0.015]]))
+    errors = np.median(np.abs(reached - steps.reached), axis=1)[:, 1]
+    assert errors.argmin() == 2
+    assert errors[2] < errors[0] / 3
 
 
 def test_several_phis_at_once_are_those_one_by_one():

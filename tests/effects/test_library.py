@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from sb3_rpto.effects import LIBRARY, Drive, Effect, Scales, Simulation, from_json
+from sb3_rpto.effects.sensors import ago
 
 ARM = mujoco.MjModel.from_xml_string("""
 <mujoco>
@@ -140,6 +141,7 @@ ROWS = {
     "command_saturation": Row("shoulder_motor", {"inverse_limit": 1.6}, {"inverse_limit": 1.2}),
     "backlash": Row("elbow_motor", {"half_width": 0.15}, {"half_width": 0.05}),
     "actuator_lag": Row("shoulder_motor", {"time_constant": 0.05}, {"time_constant": 0.01}),
+    "sensor_delay": Row("elbow", {"delay": 0.026}, {"delay": 0.01}),
     "sensor_bias": Row("elbow", {"offset": 0.05}, {"offset": 0.0}),
     "sensor_gain": Row("shoulder", {"change": 0.04}, {"change": 0.0}),
     "payload": Row("lower", {"mass": 0.3, "along": 1.6}, {"mass": 0.1, "along": 1.0}),
@@ -185,6 +187,10 @@ def shown(sim: Simulation, values: np.ndarray, qpos: np.ndarray, qvel: np.ndarra
     q, v = sim.rollout(values, qpos, qvel, drive)
     (effect,) = sim.effects
     if effect.place == "sensor":
+        time = np.arange(q.shape[1]) * sim.model.opt.timestep
+        for i in np.flatnonzero(effect.late(values)):
+            for series in (q[i, :, effect.adr], v[i, :, effect.dof]):
+                series[:] = np.interp(time - effect.late(values)[i], time, series.copy())
         q[..., effect.adr], v[..., effect.dof] = effect.observe(q[..., effect.adr], v[..., effect.dof], values)
     return q
 
@@ -336,6 +342,13 @@ def test_sensor_equations() -> None:
         np.testing.assert_allclose(effect.unobserve(*seen, x), (q, v), rtol=1e-14)
 
 
+def test_a_late_sensor_shows_the_state_between_two_steps_and_at_first_the_first() -> None:
+    q, v = np.array([[0.0, 1.0, 4.0]] * 4), np.array([[2.0, 3.0, 5.0]] * 4)
+    seen = ago(np.array([0.0, 0.25, 2.0, 9.0]), q, v)
+    np.testing.assert_allclose(seen, [[4.0, 3.25, 0.0, 0.0], [5.0, 4.5, 2.0, 2.0]])
+    np.testing.assert_allclose(ago(np.array([0.5]), q[:1, :1], v[:1, :1]), [[0.0], [2.0]])
+
+
 def one_step(model: mujoco.MjModel, effects: list[Effect], n: int = 1) -> np.ndarray:
     """Velocities after a step from a state in motion."""
     sim = Simulation(model, effects, 1)
@@ -425,7 +438,7 @@ def test_statements(kind: str) -> None:
         assert size > 0
         assert p.shape or p.lower <= p.null + size <= p.upper
     # What only writes fields of the model can be kept in an MJCF, all else is carried around it.
-    carried = any(effect("x").overrides(hook) for hook in ("act", "command", "observe"))
+    carried = any(effect("x").overrides(hook) for hook in ("act", "command", "observe", "late"))
     assert bool(effect.native) != carried
     assert effect.places(mujoco.MjModel.from_xml_string("<mujoco/>")) in ([], [""])
 

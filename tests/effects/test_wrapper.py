@@ -429,6 +429,29 @@ def test_sensors_and_commands_go_through_one_after_the_other():
     assert observation[1] == pytest.approx(np.sin(2 * (base.data.qpos[1] + 0.1)))
 
 
+def test_a_late_sensor_shows_what_was_there_before():
+    """0.026 s are two and three fifths of this task's substeps of 0.01 s, and half a step of the agent's."""
+    env, bare = gym.make(POLE), gym.make(POLE)
+    late = CorrectedEnv(env, [Bias("hinge2", b=0.1), LIBRARY["sensor_delay"]("hinge2", delay=0.026)])
+    first, _ = late.reset(seed=3)
+    bare.reset(seed=3)
+    base, substep = bare.unwrapped, bare.unwrapped.model.opt.timestep
+    states = [base.state_vector()]
+    assert first[2] == pytest.approx(np.sin(states[0][2] + 0.1)), "at first it shows the first state"
+    for action in actions_for(bare, 4):
+        shown, *_ = late.step(action)
+        for _ in range(base.frame_skip):
+            base.do_simulation(action, 1)
+            states.append(base.state_vector())
+        time = substep * np.arange(len(states))
+        angle, speed = (np.interp(time[-1] - 0.026, time, np.array(states)[:, i]) for i in (2, 5))
+        assert shown[2] == pytest.approx(np.sin(angle + 0.1))
+        assert shown[7] == pytest.approx(np.clip(2 * speed, -10, 10))
+        assert shown[1] == pytest.approx(np.sin(states[-1][1])), "the other sensors are in time"
+    again, _ = late.reset(seed=3)
+    np.testing.assert_array_equal(again, first)
+
+
 def test_what_is_covered_cannot_be_set_and_what_no_number_says_is_named():
     env = gym.make(POLE)
     beneath = CorrectedEnv(env, effects(env.unwrapped.model)[:4])

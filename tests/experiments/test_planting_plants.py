@@ -17,6 +17,7 @@ from sb3_rpto.experiments.planting.plants import (
     PositionFriction,
     QuadraticDrag,
     SensorBias,
+    SensorDelay,
     SensorGain,
     StribeckFriction,
     TorqueRipple,
@@ -146,6 +147,19 @@ def test_sensors():
     np.testing.assert_allclose([q[0, 0], qd[0, 0]], [1.1 * 1.1, 2.2])
 
 
+def test_a_late_sensor_shows_the_motion_of_before():
+    force, delay = 0.3, 0.0123
+    sim = wheel(SensorDelay(0, delay), SensorBias(0, 0.1), q=0.2)
+    np.testing.assert_allclose(np.array(sim.sense()).ravel(), [0.3, 0.0])
+    hold(sim, force, 0.0, 0.004, 2)
+    np.testing.assert_allclose(np.array(sim.sense()).ravel(), [0.3, 0.0], err_msg="at first the first state")
+    for k in range(1, 20):
+        hold(sim, force, 0.004 * k, 0.004, 2)
+    then = 0.08 - delay
+    shown = np.array(sim.sense()).ravel()
+    np.testing.assert_allclose(shown, [0.3 + force / INERTIA * then**2 / 2, force / INERTIA * then], rtol=1e-9)
+
+
 def test_elastic_transmission_keeps_momentum_and_has_its_resonance():
     rotor, stiffness = 0.02, 30.0
     plant = Flexible(0, rotor, stiffness, 0.0)
@@ -211,6 +225,8 @@ def test_places():
     assert places(SYSTEMS["cartpole"], "sensor_bias") == [1]
     assert places(SYSTEMS["reacher"], "sensor_bias") == [1]
     assert places(SYSTEMS["pendulum"], "command_gain") == []
+    assert places(SYSTEMS["pendulum"], "sensor_delay") == []
+    assert places(SYSTEMS["cartpole"], "sensor_delay") == [0, 1]
     with pytest.raises(ValueError, match="choose another effect"):
         draw("pendulum", "command_gain", "small", 0)
     with pytest.raises(ValueError, match="medium"):

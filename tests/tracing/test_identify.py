@@ -16,7 +16,7 @@ from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.effect import Effect, Parameter
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
-from sb3_rpto.effects.sensors import SensorBias
+from sb3_rpto.effects.sensors import SensorBias, SensorDelay
 from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.identify import RIDGE, TRUST, UNSTABLE, Loss, Problem, interpolate
@@ -478,3 +478,23 @@ def test_sensors_that_are_all_late_look_like_commands_that_are_late() -> None:
     assert fit.values[0] == pytest.approx(late / RATE, rel=0.02)
     assert np.median(fit.errors) < 1.1
     assert np.median(task.score(task.null).errors) > 2
+
+
+def test_a_late_sensor_is_fitted_and_its_start_lies_ahead() -> None:
+    """In a machine with one sensor it is a late command; the fit is the same from either end."""
+    data, late = recorded(), 3
+    rows = [(e.qpos[:-late], e.qvel[:-late], e.ctrl[late:]) for e in data.episodes]
+    q, v, u = (np.stack(parts) for parts in zip(*rows))
+    time = data.episodes[0].time[late:]
+    shown = Measurements.from_tables({"runs": table(time, q, v, u, compiled())})
+    task = problem([SensorDelay("hinge")], shown)
+    fit = task.fit(task.null, np.arange(1))
+    assert fit.values[0] == pytest.approx(late / RATE, rel=0.02)
+    assert np.median(fit.errors) < 1.1
+    assert np.median(task.score(task.null).errors) > 2
+
+
+def test_interpolation_goes_back_in_a_straight_line() -> None:
+    q, v = np.array([[[1.0], [2.0], [2.5]]]), np.array([[[3.0], [4.0], [5.0]]])
+    found = interpolate(q, v, np.array([[-2.0, -0.5, 0.0, 1.0]]), 0.1, np.array([0]), np.array([0]))
+    np.testing.assert_allclose(found[0, :, 0], [1 - 0.6, 1 - 0.15, 1.0, 2.0])

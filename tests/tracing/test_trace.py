@@ -115,6 +115,7 @@ def test_dry_friction_is_explained_with_its_level() -> None:
     assert low < found.effect.values[0] < high
     assert found.t > report.threshold
     assert found.frequency > 0.8
+    assert report.horizon == 0.8, "no longer windows are needed"
     assert not report.adequacy_before.adequate
     assert report.adequacy_after.adequate
     assert report.adequacy_after.ratio < 0.5 * report.adequacy_before.ratio
@@ -134,6 +135,16 @@ def test_an_effect_that_is_not_among_the_candidates_is_not_explained() -> None:
     report = traced_simply(kinds=["torque_offset"])
     assert report.verdict == "unexplained"
     assert [c.label for c in report.candidates] == ["torque_offset(hinge)"]
+
+
+def test_where_much_is_left_to_explain_longer_windows_are_looked_at() -> None:
+    there = [CoulombFriction("hinge", level=0.25), TorqueOffset("hinge", offset=0.1)]
+    data, friction = recorded(there, compiled(COARSE), 12, 3.2, rate=100), ["coulomb_friction"]
+    for horizon, used in ((None, 1.0), (0.5, 0.5)):
+        report = traced_simply(data, friction, horizon=horizon)
+        assert [t.label for t in report.effects] == ["coulomb_friction(hinge)"]
+        assert report.verdict in ("unexplained", "partly explained")
+        assert report.horizon == used, "who gives a length has it"
 
 
 # --- what a report depends on -----------------------------------------------------------------------------------------

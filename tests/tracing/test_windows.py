@@ -105,9 +105,10 @@ def test_smoothing_leaves_a_cubic_and_its_derivative_as_they_are(jitter: float, 
     t = clock(60, 200.0, jitter)
     c = np.array([[0.3, -1.0], [2.0, 0.5], [-40.0, 9.0], [300.0, -70.0]])
     powers = t[:, None] ** np.arange(4)
-    q, v, _ = smoothed_state(episode(t, powers @ c), index, np.array([1e-3, 1e-3]))
+    q, v, a, _ = smoothed_state(episode(t, powers @ c), index, np.array([1e-3, 1e-3]))
     np.testing.assert_allclose(q, powers[index] @ c, atol=1e-11)
     np.testing.assert_allclose(v, powers[index, :3] @ (c[1:] * np.arange(1, 4)[:, None]), atol=1e-9)
+    np.testing.assert_allclose(a, 2 * c[2] + 6 * t[index] * c[3], atol=1e-7)
 
 
 @pytest.mark.parametrize("index", [0, 20])
@@ -116,8 +117,8 @@ def test_spread_of_the_smoothed_state_is_that_of_repeated_noise(index: int) -> N
     t = clock(41, 200.0, 0.5)
     # As many columns as draws: all are smoothed at once.
     draws = rng.standard_normal((len(t), 2, 3000)) * sigma[:, None]
-    q, v, _ = smoothed_state(episode(t, draws.reshape(len(t), -1)), index, np.ones(6000))
-    _, _, spread = smoothed_state(episode(t, draws[:, :, 0]), index, sigma)
+    q, v, _, _ = smoothed_state(episode(t, draws.reshape(len(t), -1)), index, np.ones(6000))
+    *_, spread = smoothed_state(episode(t, draws[:, :, 0]), index, sigma)
     np.testing.assert_allclose(spread[0], q.reshape(2, -1).std(1), rtol=0.05)
     np.testing.assert_allclose(spread[1], v.reshape(2, -1).std(1), rtol=0.05)
 

@@ -58,6 +58,9 @@ class Plant:
         """Largest dry friction, >= 0; the step opposes motion with it, or holds the joint with what that takes."""
         return 0.0
 
+    def record(self, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> None:
+        """Keep the state of the joint at time ``t`` (E,); called at the start and after every step."""
+
     def sense(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What the joint's sensor says of a position and a velocity."""
         return q, v
@@ -325,6 +328,37 @@ class SensorGain(Plant):
         return self.gain * q, self.gain * v
 
 
+@dataclass
+class SensorDelay(Plant):
+    """The sensor says q(t - d) and qd(t - d), d = ``delay`` in s; before the episode, its first state.
+
+    Between two steps the position is their cubic, the velocity its derivative.
+    """
+
+    delay: float = 0.0
+    kind = "sensor_delay"
+
+    def reset(self, q: np.ndarray, rng: np.random.Generator) -> None:
+        self._past: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def record(self, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> None:
+        old = sum((then < t - self.delay).all() for then, _, _ in self._past)
+        self._past = [*self._past[max(0, old - 1) :], (t, q.copy(), v.copy())]
+
+    def sense(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if self.delay == 0 or len(self._past) < 2:
+            return q, v
+        t, past_q, past_v = (np.stack(kept) for kept in zip(*self._past))
+        at = np.maximum(t[-1] - self.delay, t[0])
+        k = np.clip((t <= at).sum(0) - 1, 0, len(t) - 2)
+        e = np.arange(len(at))
+        h = t[k + 1, e] - t[k, e]
+        s = (at - t[k, e]) / h
+        rise, v0, v1 = past_q[k + 1, e] - past_q[k, e], h * past_v[k, e], h * past_v[k + 1, e]
+        square, cube = 3 * rise - 2 * v0 - v1, v0 + v1 - 2 * rise
+        return past_q[k, e] + s * (v0 + s * (square + s * cube)), (v0 + s * (2 * square + 3 * s * cube)) / h
+
+
 LIBRARY: Sequence[type[Plant]] = (
     CoulombFriction,
     StribeckFriction,
@@ -344,6 +378,7 @@ LIBRARY: Sequence[type[Plant]] = (
     Backlash,
     CommandDelay,
     ActuatorLag,
+    SensorDelay,
     SensorBias,
     SensorGain,
 )

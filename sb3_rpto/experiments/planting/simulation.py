@@ -38,6 +38,7 @@ class Simulation:
         self.system, self.plants = system, plants
         self.q, self.qd = q.copy(), qd.copy()
         self._impulse = np.zeros_like(self.q)
+        self._begun = False
 
     def sense(self) -> tuple[np.ndarray, np.ndarray]:
         """Position and velocity as the sensors say, without noise, (E, n) each."""
@@ -59,8 +60,16 @@ class Simulation:
         for plant in self.plants:
             command[:, plant.joint] = plant.command(command[:, plant.joint], start)
         h = duration / steps
+        if not self._begun:
+            self._record(start)
+            self._begun = True
         for i in range(steps):
             self._step(command, start + i * h, h)
+            self._record(start + (i + 1) * h)
+
+    def _record(self, t: np.ndarray) -> None:
+        for plant in self.plants:
+            plant.record(t, self.q[:, plant.joint], self.qd[:, plant.joint])
 
     def _step(self, command: np.ndarray, t: np.ndarray, h: np.ndarray) -> None:
         system, v, step = self.system, self.qd, h[:, None]

@@ -32,8 +32,8 @@ OF_A_TURN = {"torque_ripple", "position_friction"}
 def places(system: System, kind: str) -> list[int]:
     """Joints at which an effect is possible and, together with what is declared, identifiable in principle.
 
-    Left out: a sensor's bias where the machine looks the same from every position, a gain where it could not be told
-    from mass and damping.
+    Left out: a sensor's bias where the machine looks the same from every position, its delay where it is the only one
+    and as good as a late command, a gain where it could not be told from mass and damping.
 
     :param system: the machine
     :param kind: one of :data:`KINDS`
@@ -51,6 +51,8 @@ def places(system: System, kind: str) -> list[int]:
         joints = [j for j in joints if system.links[j].hinge]
     if kind == "sensor_bias":
         joints = [j for j in joints if j > 0 or (system.links[j].hinge and system.vertical)]
+    if kind == "sensor_delay" and len(joints) == 1:
+        return []
     all_declared = len(system.declared) == 2 * len(system.links)
     if kind == "command_gain" and len(system.driven) == 1 and all_declared:
         return []
@@ -139,6 +141,7 @@ PARAMETERS: dict[str, _Rule] = {
     "backlash": lambda *a: {"gap": 2 * _torque()(*a)},
     "command_delay": lambda s, j, r, k: {"delay": k * r.uniform(0.007, 0.012)},
     "actuator_lag": lambda s, j, r, k: {"time_constant": k * r.uniform(0.01, 0.016)},
+    "sensor_delay": lambda s, j, r, k: {"delay": k * r.uniform(0.007, 0.012)},
     "sensor_bias": lambda s, j, r, k: {"bias": _sign(r) * k * r.uniform(0.03, 0.05) * _travel(s, j, 1.0, 0.3)},
     "sensor_gain": lambda s, j, r, k: {"gain": 1 + _sign(r) * k * r.uniform(0.04, 0.06)},
     "thermal": lambda s, j, r, k: {"drop": (0.3 if k < 2 else 0.6) * r.uniform(0.9, 1.1)},

@@ -5,6 +5,7 @@ For what the NumPy machines lack: other effects, and models of gymnasium.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.effects.names import object_names
+from sb3_rpto.effects.sensors import ago
 from sb3_rpto.effects.simulation import prepare, push
 from sb3_rpto.effects.world import BatchWorld
 from sb3_rpto.experiments.planting import SYSTEMS, Link, System
@@ -191,14 +193,21 @@ def simulate(
     forces = [(e, x) for e, x in rows if e.overrides("act")]
     chain: list[tuple[Effect, np.ndarray, dict[str, Any]]]
     chain = [(e, x, {}) for e, x in sorted(rows, key=lambda row: row[0].order) if e.overrides("command")]
-    sensors = [(e, x) for e, x in rows if e.overrides("observe")]
+    sensors = [(e, x) for e, x in rows if e.senses]
     errors = noise * streams[2].standard_normal((2, samples, episodes, model.nv))
     errors[1] *= VELOCITY_NOISE
     measured = np.empty((2, episodes, samples, model.nv))
     commands = np.zeros((episodes, samples, model.nu))
+    past = [(world.qpos.copy(), world.qvel.copy())]
     for k in range(samples):
-        q, v = world.qpos.copy(), world.qvel.copy()
+        q, v = (a.copy() for a in past[-1])
         for effect, x in sensors:
+            steps = effect.late(x) / STEP
+            if steps.any():
+                recent = past[-1 - math.ceil(steps.max()) :]
+                positions = np.stack([q_then[:, effect.adr] for q_then, _ in recent], axis=1)
+                velocities = np.stack([v_then[:, effect.dof] for _, v_then in recent], axis=1)
+                q[:, effect.adr], v[:, effect.dof] = ago(steps, positions, velocities)
             q[:, effect.adr], v[:, effect.dof] = effect.observe(q[:, effect.adr], v[:, effect.dof], x)
         measured[:, :, k] = q, v = q + errors[0, k], v + errors[1, k]
         u = excitation.command(k, q[:, moved] - machine.rest, v[:, moved])
@@ -211,6 +220,7 @@ def simulate(
                 world.ctrl[:, effect.index] = effect.command(world.ctrl[:, effect.index].copy(), x, memory, STEP)
             push(world, forces)
             world.batch.step()
+            past.append((world.qpos.copy(), world.qvel.copy()))
     if not np.isfinite(measured).all():
         raise ValueError(f"{machine.name} became unstable with {', '.join(map(str, effects))}; plant less")
 

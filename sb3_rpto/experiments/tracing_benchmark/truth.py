@@ -35,6 +35,7 @@ VALUES: dict[str, Callable[[Any], dict[str, float]]] = {
     "backlash": lambda p: {"half_width": p.gap / 2},
     "command_delay": lambda p: {"delay": p.delay},
     "actuator_lag": lambda p: {"time_constant": p.time_constant},
+    "sensor_delay": lambda p: {"delay": p.delay},
     "sensor_bias": lambda p: {"offset": p.bias},
     "sensor_gain": lambda p: {"change": p.gain - 1},
 }
