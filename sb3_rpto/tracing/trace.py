@@ -38,6 +38,8 @@ FEW = 40
 #: Where what is found leaves errors far above the noise, windows so many times as long show more of what is missing,
 #: and what only stands in for it shows too.
 LONGER = 2
+#: Most iterations of the last fits: where two parameters do nearly the same, a descent goes slowly along their valley.
+FINAL = 40
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
 
@@ -131,7 +133,7 @@ def trace(
     problem = Problem(simulation, parts[0] if len(parts) == 1 else join(*parts), scales)
     final, intervals = refit(selection, problem, seed)
     # Both models are fitted to the same data before they are compared on the test runs.
-    before = problem.fit(before.values, selector.free(()), iterations=10)
+    before = problem.fit(before.values, selector.free(()), iterations=FINAL)
 
     say(0.9, "predicting the test runs")
     data = test if test.episodes else fitted
@@ -270,7 +272,7 @@ def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 20
     """
     joined = problem.windows
     free = Selector(problem, problem, 0.0, lambda _: None).free(selection.model.effects)
-    fit = problem.fit(selection.model.fit.values, free, iterations=10)
+    fit = problem.fit(selection.model.fit.values, free, iterations=FINAL)
     intervals = np.stack([fit.values, fit.values])
     if len(free):
         linear = problem.linear(fit, free)
