@@ -26,7 +26,7 @@ from sb3_rpto.effects.world import LiveWorld
 from sb3_rpto.effects.wrapper import CorrectedEnv, active, own
 
 FORMAT = 1
-_HOOKS = ("act", "command", "observe")
+_HOOKS = ("act", "command", "observe", "late")
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ def test_design_has_the_counts_and_is_always_the_same():
     assert len(CASES) == 205, "ids are unique"
     assert len({case.seed for case in cases}) == 205
     noises = Counter(case.noise for case in cases if case.group == "single")
-    assert noises == {1e-3: 60, 5e-3: 40}
+    assert noises == {1e-3: 63, 5e-3: 42}
     single = Counter(case.effects[0] for case in cases if case.group == "single")
     library = [kind for kind, plant in KINDS.items() if plant.library]
     assert {kind for kind, _ in single} == set(library)
@@ -150,6 +150,9 @@ def test_library_effects_do_what_the_planted_ones_do(kind):
         for e in effects:
             if e.overrides("observe"):
                 q[..., e.adr] = e.observe(q[..., e.adr], q[..., e.adr], e.values[None])[0]
+            if e.overrides("late"):
+                time = 0.004 * np.arange(q.shape[1])
+                q[..., e.adr] = [np.interp(time - e.late(e.values), time, series) for series in q[..., e.adr]]
         error.append(np.sqrt(np.mean((q - measured) ** 2)))
     assert error[0] < 0.1 * error[1]
 
@@ -448,12 +451,12 @@ def test_tables(tmp_path):
 
 @pytest.fixture
 def traced(monkeypatch):
-    """Ids of the cases that a fake tracer was given; it fails on a torque offset."""
+    """Ids of the cases that a fake tracer was given; it fails on a drag."""
     seen = []
 
     def examine(case):
         seen.append(case.id)
-        if "torque_offset" in case.id:
+        if "quadratic_drag" in case.id:
             raise ValueError("no such thing")
         made = result(case.id, planted={}, ratio_before=math.nan)
         return {name: made[name] for name in made if name not in ("case", "version", "commit", "error")}
@@ -470,7 +473,7 @@ def test_a_run_repeats_nothing_that_is_done(traced, tmp_path):
     assert traced != ids
     order = list(traced)
     failed = [r for r in results if r["error"]]
-    assert ["torque_offset" in r["case"]["id"] for r in failed] == [True]
+    assert ["quadratic_drag" in r["case"]["id"] for r in failed] == [True]
     assert "no such thing" in failed[0]["error"]
     assert results[0]["ratio_before"] is None, "strict JSON"
     assert run(tmp_path, "quick", 1, only="^single") == results
