@@ -13,18 +13,17 @@ import numpy as np
 from sb3_rpto.effects import LIBRARY, Declared, Effect, Simulation, declare
 from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.model import load_model
-from sb3_rpto.tracing.adequacy import Adequacy, adequacy
-from sb3_rpto.tracing.calibrate import calibrated
+from sb3_rpto.tracing.adequacy import Adequacy
 from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
-from sb3_rpto.tracing.identify import Fit, Problem
+from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.model_checks import check_against
 from sb3_rpto.tracing.report import Candidate, Report, Traced
 from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary, typical
-from sb3_rpto.tracing.screen import Screening, screen
-from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
+from sb3_rpto.tracing.screen import Screening
+from sb3_rpto.tracing.search import Selectors, find
+from sb3_rpto.tracing.select import Selection, Selector
 from sb3_rpto.tracing.windows import Windows, cut, discretised, noise_levels
 
 #: Most windows to fit, and to select on.
@@ -40,8 +39,6 @@ FEW = 40
 LONGER = 2
 #: Most iterations of the last fits: where two parameters do nearly the same, a descent goes slowly along their valley.
 FINAL = 40
-#: Declared parameters are fitted from so many starts.
-STARTS = 3
 
 Progress = Callable[[float, str], None]
 
@@ -92,60 +89,39 @@ def trace(
     scales = typical(simulation, force_residuals(simulation, simulation.null, fitted)).scales(effects)
     coarse = Simulation(discretised(compiled, data, fine=False), effects, threads)
 
-    def selectors(length: float) -> tuple[Selector, Selector]:
-        """On windows of this length: one that integrates finely, one as the model does."""
+    def selectors(length: float) -> Selectors:
         fine, rough = (_windows(s.model, train, select, sigma, length) for s in (simulation, coarse))
-        return Selector.on(simulation, fine, scales, length, say), Selector.on(coarse, rough, scales, length, say)
+        return Selectors(
+            Selector.on(simulation, fine, scales, length, say), Selector.on(coarse, rough, scales, length, say), say
+        )
 
     length = _horizon(fitted) if horizon is None else horizon
-    selector, rough = selectors(length)
+    longer = LONGER * length if horizon is None and _holds(fitted, LONGER * length) else None
+    found = find(selectors, length, longer, seed, calibrate)
+    selector, selection = found.on.fine, found.selection
     if selector.select is None:
         count = len(selector.train.windows)
         message = f"selected on {count} windows of the training runs by cross-validation over blocks"
         findings.append(Finding("split", "training runs", message))
-
-    say(0.05, "fitting the declared parameters")
-    base = selector.model((), fit_declared(rough, seed), iterations=10)
-    first = judged(selector, base, seed)
-    screening: Screening | None = None
-    selection = Selection(base)
-    if not first.adequate:
-        say(0.15, "screening the candidates")
-        screening = screen(selector.train, base.fit)
-        if calibrate:
-            say(0.2, f"calibrating on {calibrate} complete sets")
-            t = calibrated(rough, rough.model((), base.fit).fit, worth_fitting(selector, screening), calibrate, seed)
-            selector.threshold = rough.threshold = t
-        selection = search(selector, rough, base, screening, say)
-        if horizon is None and selector.far(selection.model) and _holds(fitted, LONGER * length):
-            say(0.75, "looking at longer windows")
-            longer = selectors(LONGER * length)
-            found = search_on(*longer, selection, worth_fitting(selector, screening), screening, say)
-            if found.model.effects:
-                selector, selection = longer[0], found
-                base = selector.model((), selector.train.score(base.fit.values), iterations=10)
-                first = judged(selector, base, seed)
-    last = judged(selector, selection.model, seed)
-    before = base.fit
 
     say(0.85, "fitting the final model")
     parts = [p.windows for p in (selector.train, selector.select) if p is not None]
     problem = Problem(simulation, parts[0] if len(parts) == 1 else join(*parts), scales)
     final, intervals = refit(selection, problem, seed)
     # Both models are fitted to the same data before they are compared on the test runs.
-    before = problem.fit(before.values, selector.free(()), iterations=FINAL)
+    before = problem.fit(found.base.fit.values, selector.free(()), iterations=FINAL)
 
     say(0.9, "predicting the test runs")
     data = test if test.episodes else fitted
     residuals_before = force_residuals(simulation, before.values, data)
     residuals_after = force_residuals(simulation, final, data)
     return Report(
-        verdict=judge(first, last, bool(selection.model.effects)),
+        verdict=judge(found.before, found.after, bool(selection.model.effects)),
         declared=_declared(simulation, final, intervals),
         effects=_kept(selection, simulation, final, intervals, selector.limit(selection.model), seed),
-        candidates=_fates(simulation, screening, selection),
-        adequacy_before=first,
-        adequacy_after=last,
+        candidates=_fates(simulation, found.screening, selection),
+        adequacy_before=found.before,
+        adequacy_after=found.after,
         before=horizon_errors(simulation, before.values, data, sigma, seed),
         after=horizon_errors(simulation, final, data, sigma, seed),
         floor=noise_floor(simulation, final, data, sigma, seed),
@@ -184,85 +160,6 @@ def _steady(progress: Progress | None) -> Progress:
             progress(reached, what)
 
     return say
-
-
-def fit_declared(selector: Selector, seed: int) -> Fit:
-    """Fit the declared parameters from several starts, none at a bound, and lead the best one on."""
-    problem, free = selector.train, selector.free(())
-    begin = problem.simulation.null.copy()
-    best = problem.fit(begin, free, iterations=20)
-    if not len(free):
-        return best
-    rng = np.random.default_rng(seed)
-    for _ in range(STARTS - 1):
-        start = begin.copy()
-        step = rng.uniform(-3, 3, len(free)) * problem.size[free]
-        margin = 0.5 * problem.size[free]
-        start[free] = np.clip(begin[free] + step, problem.lower[free] + margin, problem.upper[free] - margin)
-        other = problem.fit(start, free, iterations=20)
-        if other.cost < 0.999 * best.cost:
-            best = other
-    return led_on(problem, best, free)
-
-
-def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
-    """The excited candidates, one of each class."""
-    chosen: list[int] = []
-    for i, effect in enumerate(selector.simulation.effects):
-        if _is_declared(effect) or not screening.excited(i):
-            continue
-        if not any(j in chosen for j in screening.alike(i)):
-            chosen.append(i)
-    return chosen
-
-
-def search(selector: Selector, rough: Selector, base: Model, screening: Screening, say: Progress) -> Selection:
-    """Joint fit of all excited candidates, elimination backwards, a last look forward, substitution by like ones.
-
-    Where the joint fit ends far from the noise and no nearer than it began, effects are added one by one instead.
-
-    :param selector: integrates finely, for what is decided in the end
-    :param rough: integrates as the model does, for the elimination: it costs most
-    :param base: the declared parameters alone
-    """
-    chosen = worth_fitting(selector, screening)
-    say(0.2, f"fitting {len(chosen)} candidates together")
-    alone = rough.model((), base.fit)
-    joint = rough.together(chosen, alone.fit)
-    if rough.far(joint) and not rough.evidence(joint, alone).clear(SEEMS):  # no place to begin
-        selection = rough.look_forward(Selection(alone), chosen, INSTEAD)
-    else:
-        # What seems to matter stays while much else may still be wrong.
-        selection = rough.look_forward(rough.eliminate(Selection(joint), SEEMS), chosen)
-    return settle(selector, rough, selection, screening, say)
-
-
-def search_on(
-    selector: Selector, rough: Selector, found: Selection, chosen: Sequence[int], screening: Screening, say: Progress
-) -> Selection:
-    """Go on from what was found with other windows: what is missing is added, what is not needed goes.
-
-    Arguments as in :func:`search`, with all excited candidates.
-    """
-    begin = rough.model(found.model.effects, rough.train.score(found.model.fit.values), iterations=10)
-    selection = rough.look_forward(Selection(begin, dropped=dict(found.dropped)), chosen)
-    return settle(selector, rough, selection, screening, say)
-
-
-def settle(selector: Selector, rough: Selector, selection: Selection, screening: Screening, say: Progress) -> Selection:
-    """Elimination to what is clearly needed, substitution by like effects, and the evidence for what remains."""
-    selection = rough.eliminate(selection)
-    say(0.7, "trying like effects in their place")
-    selection = rough.merge(rough.substitute(selection, screening), screening)
-    selection.model = selector.led_on(selector.model(selection.model.effects, selection.model.fit, iterations=10))
-    if selector.train.exact:  # only now are the fits good enough to tell
-        selection.model = selector.simplest(selection.model, selection, screening)
-    return selector.judge(selection)
-
-
-def judged(selector: Selector, model: Model, seed: int) -> Adequacy:
-    """How a model's errors compare with those of the noise alone, on the windows to judge."""
-    return adequacy(selector.judging, selector.judging.score(model.fit.values), seed)
 
 
 def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 200) -> tuple[np.ndarray, np.ndarray]:

@@ -13,8 +13,8 @@ from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, StribeckFr
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit
 from sb3_rpto.tracing.screen import screen
+from sb3_rpto.tracing.search import Selectors, search
 from sb3_rpto.tracing.select import FAR, INSTEAD, LIKELY, ROUNDS, TENTH, Model, Selection, Selector
-from sb3_rpto.tracing.trace import search
 from sb3_rpto.tracing.windows import cut
 
 THRESHOLD = 3.5
@@ -166,7 +166,7 @@ def test_a_joint_fit_that_is_no_better_than_none_gives_way_to_effects_one_by_one
         return replace(joint, errors=2 * base.errors) if stuck else joint
 
     s.look_forward, s.together = looking, ending_badly  # type: ignore[method-assign, assignment]
-    selection = search(s, s, base, screen(s.train, base.fit), lambda share, what: None)
+    selection = search(Selectors(s, s, lambda share, what: None), base, screen(s.train, base.fit))
     assert selection.model.effects == (COULOMB,)
     assert forward == [INSTEAD if stuck else ROUNDS]
 

@@ -1,0 +1,164 @@
+"""The search for what a model lacks: what is declared first, then all candidates, in windows of one length or two."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_rpto.tracing.adequacy import Adequacy, adequacy
+from sb3_rpto.tracing.calibrate import calibrated
+from sb3_rpto.tracing.concentrate import led_on
+from sb3_rpto.tracing.identify import Fit
+from sb3_rpto.tracing.screen import Screening, screen
+from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
+
+#: Declared parameters are fitted from so many starts.
+STARTS = 3
+
+
+@dataclass(frozen=True)
+class Selectors:
+    """Selectors on windows of one length.
+
+    :param fine: integrates finely, for what is decided in the end
+    :param rough: integrates as the model does, for the elimination: it costs most
+    :param say: progress
+    """
+
+    fine: Selector
+    rough: Selector
+    say: Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Found:
+    """The outcome of the search.
+
+    :param on: the windows that it ended with
+    :param base: the declared parameters alone
+    :param before: its adequacy
+    :param screening: of the candidates; None where nothing is missing
+    :param selection: what is kept
+    :param after: its adequacy
+    """
+
+    on: Selectors
+    base: Model
+    before: Adequacy
+    screening: Screening | None
+    selection: Selection
+    after: Adequacy
+
+
+def find(
+    selectors: Callable[[float], Selectors], length: float, longer: float | None, seed: int, calibrate: int
+) -> Found:
+    """Fit what is declared; where that is not enough, search, and where much is left, go on with longer windows.
+
+    :param selectors: on windows of a length in s
+    :param length: of the windows
+    :param longer: of the windows to go on with; None: there are none
+    :param seed: of the starts and the resampling
+    :param calibrate: see :func:`sb3_rpto.tracing.trace.trace`
+    """
+    on = selectors(length)
+    on.say(0.05, "fitting the declared parameters")
+    base = on.fine.model((), fit_declared(on.rough, seed), iterations=10)
+    before = judged(on.fine, base, seed)
+    if before.adequate:
+        return Found(on, base, before, None, Selection(base), before)
+    on.say(0.15, "screening the candidates")
+    screening = screen(on.fine.train, base.fit)
+    if calibrate:
+        on.say(0.2, f"calibrating on {calibrate} complete sets")
+        t = calibrated(on.rough, on.rough.model((), base.fit).fit, worth_fitting(on.fine, screening), calibrate, seed)
+        on.fine.threshold = on.rough.threshold = t
+    selection = search(on, base, screening)
+    if longer is not None and on.fine.far(selection.model):
+        on.say(0.75, "looking at longer windows")
+        then = selectors(longer)
+        then.fine.threshold = then.rough.threshold = on.fine.threshold
+        more = go_on(then, selection, screening)
+        if more.model.effects:
+            on, selection = then, more
+            base = on.fine.model((), on.fine.train.score(base.fit.values), iterations=10)
+            before = judged(on.fine, base, seed)
+    return Found(on, base, before, screening, selection, judged(on.fine, selection.model, seed))
+
+
+def fit_declared(selector: Selector, seed: int) -> Fit:
+    """Fit the declared parameters from several starts, none at a bound, and lead the best one on."""
+    problem, free = selector.train, selector.free(())
+    begin = problem.simulation.null.copy()
+    best = problem.fit(begin, free, iterations=20)
+    if not len(free):
+        return best
+    rng = np.random.default_rng(seed)
+    for _ in range(STARTS - 1):
+        start = begin.copy()
+        step = rng.uniform(-3, 3, len(free)) * problem.size[free]
+        margin = 0.5 * problem.size[free]
+        start[free] = np.clip(begin[free] + step, problem.lower[free] + margin, problem.upper[free] - margin)
+        other = problem.fit(start, free, iterations=20)
+        if other.cost < 0.999 * best.cost:
+            best = other
+    return led_on(problem, best, free)
+
+
+def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
+    """The excited candidates, one of each class."""
+    chosen: list[int] = []
+    for i, effect in enumerate(selector.simulation.effects):
+        if effect.kind == "declared" or not screening.excited(i):
+            continue
+        if not any(j in chosen for j in screening.alike(i)):
+            chosen.append(i)
+    return chosen
+
+
+def search(on: Selectors, base: Model, screening: Screening) -> Selection:
+    """Joint fit of all excited candidates, elimination backwards, a last look forward, substitution by like ones.
+
+    Where the joint fit ends far from the noise and no nearer than it began, effects are added one by one instead.
+
+    :param on: windows
+    :param base: the declared parameters alone
+    :param screening: of the candidates
+    """
+    rough, chosen = on.rough, worth_fitting(on.fine, screening)
+    on.say(0.2, f"fitting {len(chosen)} candidates together")
+    alone = rough.model((), base.fit)
+    joint = rough.together(chosen, alone.fit)
+    if rough.far(joint) and not rough.evidence(joint, alone).clear(SEEMS):  # no place to begin
+        selection = rough.look_forward(Selection(alone), chosen, INSTEAD)
+    else:
+        # What seems to matter stays while much else may still be wrong.
+        selection = rough.look_forward(rough.eliminate(Selection(joint), SEEMS), chosen)
+    return settle(on, selection, screening)
+
+
+def go_on(on: Selectors, found: Selection, screening: Screening) -> Selection:
+    """Go on from what was found with other windows: what is missing is added, what is not needed goes."""
+    rough = on.rough
+    begin = rough.model(found.model.effects, rough.train.score(found.model.fit.values), iterations=10)
+    selection = rough.look_forward(Selection(begin, dropped=dict(found.dropped)), worth_fitting(on.fine, screening))
+    return settle(on, selection, screening)
+
+
+def settle(on: Selectors, selection: Selection, screening: Screening) -> Selection:
+    """Elimination to what is clearly needed, substitution by like effects, and the evidence for what remains."""
+    selector, rough = on.fine, on.rough
+    selection = rough.eliminate(selection)
+    on.say(0.7, "trying like effects in their place")
+    selection = rough.merge(rough.substitute(selection, screening), screening)
+    selection.model = selector.led_on(selector.model(selection.model.effects, selection.model.fit, iterations=10))
+    if selector.train.exact:  # only now are the fits good enough to tell
+        selection.model = selector.simplest(selection.model, selection, screening)
+    return selector.judge(selection)
+
+
+def judged(selector: Selector, model: Model, seed: int) -> Adequacy:
+    """How a model's errors compare with those of the noise alone, on the windows to judge."""
+    return adequacy(selector.judging, selector.judging.score(model.fit.values), seed)
