@@ -89,14 +89,16 @@ def trace(
     scales = typical(simulation, force_residuals(simulation, simulation.null, fitted)).scales(effects)
     coarse = Simulation(discretised(compiled, data, fine=False), effects, threads)
 
-    def selectors(length: float) -> Selectors:
-        fine, rough = (_windows(s.model, train, select, sigma, length) for s in (simulation, coarse))
-        return Selectors(
-            Selector.on(simulation, fine, scales, length, say), Selector.on(coarse, rough, scales, length, say), say
-        )
-
     length = _horizon(fitted) if horizon is None else horizon
     longer = LONGER * length if horizon is None and _holds(fitted, LONGER * length) else None
+
+    def selectors(horizon: float) -> Selectors:
+        overlap = 1 - length / horizon  # longer windows begin where the others do
+        fine, rough = (_windows(s.model, train, select, sigma, horizon, overlap) for s in (simulation, coarse))
+        return Selectors(
+            Selector.on(simulation, fine, scales, horizon, say), Selector.on(coarse, rough, scales, horizon, say), say
+        )
+
     found = find(selectors, length, longer, seed, calibrate)
     selector, selection = found.on.fine, found.selection
     if selector.select is None:
@@ -260,16 +262,21 @@ def _holds(data: Measurements, length: float) -> bool:
 
 
 def _windows(
-    model: mujoco.MjModel, train: Measurements, select: Measurements, sigma: np.ndarray, horizon: float
+    model: mujoco.MjModel,
+    train: Measurements,
+    select: Measurements,
+    sigma: np.ndarray,
+    horizon: float,
+    overlap: float,
 ) -> tuple[Windows, Windows | None]:
     """Windows to fit and to select on; None to select on where too little is set apart: then blocks take turns."""
     if select.episodes:
-        judging = cut(model, select, sigma, horizon, SELECT)
+        judging = cut(model, select, sigma, horizon, SELECT, overlap)
         # A single block is no evidence for anything.
         if len(np.unique(judging.block)) > 1:
-            return cut(model, train, sigma, horizon, TRAIN), judging
+            return cut(model, train, sigma, horizon, TRAIN, overlap), judging
         train = replace(train, episodes=train.episodes + select.episodes)
-    every = cut(model, train, sigma, horizon, TRAIN + SELECT)
+    every = cut(model, train, sigma, horizon, TRAIN + SELECT, overlap)
     if len(every) < FEW:
         every = cut(model, train, sigma, horizon, 2 * FEW, overlap=OVERLAP)
         if len(np.unique(every.block)) < 3:
