@@ -155,6 +155,7 @@ def settle(on: Selectors, selection: Selection, screening: Screening) -> Selecti
     selection = rough.merge(rough.substitute(selection, screening), screening)
     selection.model = selector.led_on(selector.model(selection.model.effects, selection.model.fit, iterations=10))
     if selector.train.exact:  # only now are the fits good enough to tell
+        selection.model = selector.uniform(selection.model, selection, screening)
         selection.model = selector.simplest(selection.model, selection, screening)
     return selector.judge(selection)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -39,8 +40,9 @@ ROUNDS, INSTEAD, PROMISING = 3, 8, 4
 MERGES = 3
 #: Typical window error, in units of the noise, that leaves nothing to look forward to.
 ENOUGH = 1.1
-#: Candidates for a substitution are the likest so many, of at least this cosine.
-SUBSTITUTES, LIKE = 5, 0.3
+#: Candidates for a substitution are the likest so many, of at least this cosine; of a kind that is nowhere kept, which
+#: could stand in all places, at least the second.
+SUBSTITUTES, LIKE, AKIN = 5, 0.3, 0.6
 
 Say = Callable[[str], None]
 
@@ -307,6 +309,27 @@ class Selector:
         selection.model = current
         return selection
 
+    def uniform(self, model: Model, selection: Selection, screening: Screening) -> Model:
+        """Try the kind that is kept most in the place of each odd one that it resembles: joints are built alike.
+
+        An odd one may have been chosen while the others were still wrong.
+        """
+        kind_of = [e.kind for e in self.simulation.effects]
+        count = Counter(kind_of[e] for e in model.effects)
+        for e in model.effects:
+            kind, places = count.most_common(1)[0]
+            same = [i for i, k in enumerate(kind_of) if k == kind and i not in model.effects and screening.excited(i)]
+            other = max(same, key=lambda i: screening.cosine[e, i], default=e)
+            if places < 2 or kind_of[e] == kind or screening.cosine[e, other] < LIKE:
+                continue
+            self.say(f"{self.simulation.effects[other].label}, as elsewhere")
+            begin = self._translated(model, e, other)
+            trial = self.led_on(self.model([i for i in model.effects if i != e] + [other], begin, REFIT + 3))
+            if self._better(trial, model):
+                model = trial
+                selection.alike[other] = sorted({*selection.alike.pop(e, [])} - {other})
+        return model
+
     def simplest(self, model: Model, selection: Selection, screening: Screening) -> Model:
         """Take the simpler ones of a class that do as well now that all else is right: richer ones win by trifles."""
         for e in model.effects:
@@ -325,12 +348,13 @@ class Selector:
         return model
 
     def _alike_everywhere(self, model: Model, screening: Screening) -> Model:
-        """Try each kept kind in the place of all others that it resembles, at once: one alone may look no better."""
+        """Try each kind in the place of all others that it resembles, at once: one alone may look no better."""
         kind_of = [e.kind for e in self.simulation.effects]
-        for kind in sorted({kind_of[e] for e in model.effects}):
+        for kind in sorted({*kind_of} - {"declared"}):
+            like = LIKE if kind in {kind_of[e] for e in model.effects} else AKIN
             same = [i for i, k in enumerate(kind_of) if k == kind and screening.excited(i)]
             nearest = {e: max(same, key=lambda i: screening.cosine[e, i], default=e) for e in model.effects}
-            swaps = {e: i for e, i in nearest.items() if kind_of[e] != kind and screening.cosine[e, i] > LIKE}
+            swaps = {e: i for e, i in nearest.items() if kind_of[e] != kind and screening.cosine[e, i] > like}
             trial_effects = sorted({swaps.get(e, e) for e in model.effects})
             if len(swaps) < 2 or len(trial_effects) < len(model.effects):
                 continue

@@ -303,5 +303,29 @@ def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
     assert s.simplest(rich, Selection(rich), found).effects == (0,)
 
 
+#: three links, of which a motor drives the first
+CHAIN = """<mujoco><option timestep="0.005" integrator="RK4"><flag contact="disable"/></option><worldbody>
+<body name="a"><joint name="one" axis="0 -1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="0.4"/>
+<body pos="0 0 -.3"><joint name="two" axis="0 -1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="0.3"/>
+<body pos="0 0 -.3"><joint name="three" axis="0 -1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="0.2"/>
+</body></body></body></worldbody><actuator><motor name="motor" joint="one"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("kept", [(0, 1, 5), (3, 4, 5)])
+def test_joints_are_built_alike(kept: tuple[int, ...]) -> None:
+    """Dry friction at three joints: one odd kind is made like the others, and three wrong ones are made right at once."""
+    joints, model = ("one", "two", "three"), compiled(CHAIN)
+    effects: list[Effect] = [kind(j) for kind in (CoulombFriction, ViscousFriction) for j in joints]
+    there = [CoulombFriction(j, level=level) for j, level in zip(joints, (0.1, 0.06, 0.03))]
+    data = recorded(there, model, noise=0.0, exact=True)
+    s = Selector(problem(effects, data, noise=1e-5, model=model), None, THRESHOLD, lambda what: None)
+    found = screen(s.train, s.model((), s.train.score(s.train.null)).fit)
+    wrong = s.model(kept, s.train.fit(s.train.null, s.free(kept)))
+    if 0 in kept:
+        assert s.uniform(wrong, Selection(wrong), found).effects == (0, 1, 2)
+    else:
+        assert s.substitute(Selection(wrong), found).model.effects == (0, 1, 2)
+
+
 def test_noisy_data_are_not_exact() -> None:
     assert not with_friction()[0].train.exact
