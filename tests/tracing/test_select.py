@@ -304,16 +304,16 @@ def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
 
 
 #: three links, of which a motor drives the first
-CHAIN = """<mujoco><option timestep="0.005" integrator="RK4"><flag contact="disable"/></option><worldbody>
-<body name="a"><joint name="one" axis="0 -1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="0.4"/>
-<body pos="0 0 -.3"><joint name="two" axis="0 -1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="0.3"/>
-<body pos="0 0 -.3"><joint name="three" axis="0 -1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="0.2"/>
-</body></body></body></worldbody><actuator><motor name="motor" joint="one"/></actuator></mujoco>"""
+LINK = """<body pos="0 0 -.3"><joint name="{0}" axis="0 -1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="{1}"/>"""
+CHAIN = f"""<mujoco><option timestep="0.005" integrator="RK4"><flag contact="disable"/></option><worldbody>
+{LINK.format("one", 0.4)}{LINK.format("two", 0.3)}{LINK.format("three", 0.2)}</body></body></body></worldbody>
+<actuator><motor name="motor" joint="one"/></actuator></mujoco>"""
 
 
 @pytest.mark.parametrize("kept", [(0, 1, 5), (3, 4, 5)])
 def test_joints_are_built_alike(kept: tuple[int, ...]) -> None:
-    """Dry friction at three joints: one odd kind is made like the others, and three wrong ones are made right at once."""
+    """Dry friction at three joints: one odd kind is made like the others, three wrong ones are made right at once."""
     joints, model = ("one", "two", "three"), compiled(CHAIN)
     effects: list[Effect] = [kind(j) for kind in (CoulombFriction, ViscousFriction) for j in joints]
     there = [CoulombFriction(j, level=level) for j, level in zip(joints, (0.1, 0.06, 0.03))]
