@@ -26,6 +26,9 @@ from sb3_rpto.experiments import closed_loop as study
 from sb3_rpto.experiments.plots import learning_curves
 
 
+PLACE = ["task", "shift", "target", "method"]
+
+
 def main() -> None:
     """Run what is missing, then write the tables of all that is there."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -74,6 +77,7 @@ def main() -> None:
     manifest = {
         "command": "python examples/closed_loop_study.py" + (" --quick" if a.quick else ""),
         "settings": settings,
+        "seeds run": {" ".join(map(str, p)): sorted(set(map(int, r["seed"]))) for p, r in rows.groupby(PLACE)},
         "targets": study.fingerprint(),
         "versions": {name: version(name) for name in packages},
         "python": platform.python_version(),
