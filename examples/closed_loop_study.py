@@ -25,7 +25,6 @@ from tqdm import tqdm
 from sb3_rpto.experiments import closed_loop as study
 from sb3_rpto.experiments.plots import learning_curves
 
-
 PLACE = ["task", "shift", "target", "method"]
 
 

@@ -466,28 +466,15 @@ def test_samples_that_do_not_count_count_nowhere() -> None:
     assert np.median(masked.noise_errors(fit, 0)) == pytest.approx(1.0, abs=0.05)
 
 
-def test_sensors_that_are_all_late_look_like_commands_that_are_late() -> None:
+@pytest.mark.parametrize("effect", [CommandDelay("motor"), SensorDelay("hinge")], ids=lambda effect: effect.kind)
+def test_sensors_that_are_all_late_look_like_commands_that_are_late(effect: Effect) -> None:
     """What they show at t is the motion at t - d, to which the commands of t - d belong."""
     data, late = recorded(), 2
     rows = [(e.qpos[:-late], e.qvel[:-late], e.ctrl[late:]) for e in data.episodes]
     q, v, u = (np.stack(parts) for parts in zip(*rows))
     time = data.episodes[0].time[late:]
     shown = Measurements.from_tables({"runs": table(time, q, v, u, compiled())})
-    task = problem([CommandDelay("motor")], shown)
-    fit = task.fit(task.null, np.arange(1))
-    assert fit.values[0] == pytest.approx(late / RATE, rel=0.02)
-    assert np.median(fit.errors) < 1.1
-    assert np.median(task.score(task.null).errors) > 2
-
-
-def test_a_late_sensor_is_fitted_and_its_start_lies_ahead() -> None:
-    """In a machine with one sensor it is a late command; the fit is the same from either end."""
-    data, late = recorded(), 3
-    rows = [(e.qpos[:-late], e.qvel[:-late], e.ctrl[late:]) for e in data.episodes]
-    q, v, u = (np.stack(parts) for parts in zip(*rows))
-    time = data.episodes[0].time[late:]
-    shown = Measurements.from_tables({"runs": table(time, q, v, u, compiled())})
-    task = problem([SensorDelay("hinge")], shown)
+    task = problem([effect], shown)
     fit = task.fit(task.null, np.arange(1))
     assert fit.values[0] == pytest.approx(late / RATE, rel=0.02)
     assert np.median(fit.errors) < 1.1
