@@ -353,7 +353,9 @@ class Selector:
         for kind in sorted({*kind_of} - {"declared"}):
             like = LIKE if kind in {kind_of[e] for e in model.effects} else AKIN
             same = [i for i, k in enumerate(kind_of) if k == kind and screening.excited(i)]
-            nearest = {e: max(same, key=lambda i: screening.cosine[e, i], default=e) for e in model.effects}
+            if not same:
+                continue
+            nearest = {e: max(same, key=lambda i: screening.cosine[e, i]) for e in model.effects}
             swaps = {e: i for e, i in nearest.items() if kind_of[e] != kind and screening.cosine[e, i] > like}
             trial_effects = sorted({swaps.get(e, e) for e in model.effects})
             if len(swaps) < 2 or len(trial_effects) < len(model.effects):
