@@ -11,6 +11,7 @@ from sb3_rpto.tracing.adequacy import Adequacy, adequacy
 from sb3_rpto.tracing.calibrate import calibrated
 from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.identify import Fit
+from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.screen import Screening, screen
 from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
 
@@ -99,7 +100,7 @@ def fit_declared(selector: Selector, seed: int) -> Fit:
     for _ in range(STARTS - 1):
         start = begin.copy()
         step = rng.uniform(-3, 3, len(free)) * problem.size[free]
-        margin = 0.5 * problem.size[free]
+        margin = np.minimum(0.5 * problem.size[free], 0.25 * (problem.upper - problem.lower)[free])
         start[free] = np.clip(begin[free] + step, problem.lower[free] + margin, problem.upper[free] - margin)
         other = problem.fit(start, free, iterations=20)
         if other.cost < 0.999 * best.cost:
@@ -121,7 +122,8 @@ def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
 def search(on: Selectors, base: Model, screening: Screening) -> Selection:
     """Joint fit of all excited candidates, elimination backwards, a last look forward, substitution by like ones.
 
-    Where the joint fit ends far from the noise and no nearer than it began, effects are added one by one instead.
+    Where the joint fit ends far from the noise and no nearer than it began, the best few kinds at all their places take
+    its place, and where they do no better either, effects are added one by one.
 
     :param on: windows
     :param base: the declared parameters alone
@@ -130,12 +132,12 @@ def search(on: Selectors, base: Model, screening: Screening) -> Selection:
     rough, chosen = on.rough, worth_fitting(on.fine, screening)
     on.say(0.2, f"fitting {len(chosen)} candidates together")
     alone = rough.model((), base.fit)
-    joint = rough.together(chosen, alone.fit)
-    if rough.far(joint) and not rough.evidence(joint, alone).clear(SEEMS):  # no place to begin
-        selection = rough.look_forward(Selection(alone), chosen, INSTEAD)
+    begins = [model for model in rough.together(chosen, alone.fit) if model is not None]
+    nearer = [m for m in begins if not rough.far(m) or rough.evidence(m, alone).clear(SEEMS)]
+    if nearer:  # what seems to matter stays while much else may still be wrong
+        selection = rough.look_forward(rough.eliminate(Selection(nearer[0]), SEEMS), chosen)
     else:
-        # What seems to matter stays while much else may still be wrong.
-        selection = rough.look_forward(rough.eliminate(Selection(joint), SEEMS), chosen)
+        selection = rough.look_forward(Selection(alone), chosen, INSTEAD)
     return settle(on, selection, screening)
 
 
@@ -152,11 +154,13 @@ def settle(on: Selectors, selection: Selection, screening: Screening) -> Selecti
     selector, rough = on.fine, on.rough
     selection = rough.eliminate(selection)
     on.say(0.7, "trying like effects in their place")
-    selection = rough.merge(rough.substitute(selection, screening), screening)
+    likes = Likes(rough, screening)
+    selection = likes.merge(likes.substitute(selection))
     selection.model = selector.led_on(selector.model(selection.model.effects, selection.model.fit, iterations=10))
     if selector.train.exact:  # only now are the fits good enough to tell
-        selection.model = selector.uniform(selection.model, selection, screening)
-        selection.model = selector.simplest(selection.model, selection, screening)
+        likes = Likes(selector, screening)
+        selection.model = likes.uniform(selection.model, selection)
+        selection.model = likes.simplest(selection.model, selection)
     return selector.judge(selection)
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 
 import numpy as np
 
@@ -14,7 +12,6 @@ from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit, Problem
-from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.windows import Windows
 
 #: t*, between the 3 and 4 that complete data usually give as the 95 % quantile of the largest t; `calibrate` measures
@@ -36,13 +33,8 @@ TRIFLE = 0.01
 SEEMS = 1.5
 #: Rounds of the look forward, after a joint fit and in its place, and candidates fitted in each.
 ROUNDS, INSTEAD, PROMISING = 3, 8, 4
-#: Pairs of kept effects in whose place one is tried.
-MERGES = 3
 #: Typical window error, in units of the noise, that leaves nothing to look forward to.
 ENOUGH = 1.1
-#: Candidates for a substitution are the likest so many, of at least this cosine; of a kind that is nowhere kept, which
-#: could stand in all places, at least the second.
-SUBSTITUTES, LIKE, AKIN = 5, 0.3, 0.6
 
 Say = Callable[[str], None]
 
@@ -131,20 +123,23 @@ class Selector:
             np.concatenate([np.arange(s.start, s.stop) for s in keep]).astype(int) if keep else np.empty(0, dtype=int)
         )
 
-    def together(self, effects: Sequence[int], base: Fit) -> Model:
-        """Fit all candidates at once, from the base; where that ends badly, again from the best few of them.
+    def together(self, effects: Sequence[int], base: Fit) -> tuple[Model, Model | None]:
+        """Fit all candidates at once, from the base; where that ends badly, again from the best few of their kinds.
 
         The cost has local minima where many effects begin at their nulls.
+
+        :return: the model of all, and that of the best few kinds where it was needed
         """
         free = self.free(effects)
-        best = self.train.fit(base.values, free, base.starts, JOINT, tolerance=3e-3)
+        best, few = self.train.fit(base.values, free, base.starts, JOINT, tolerance=3e-3), None
         if np.median(best.errors) > ENOUGH:
-            other = self.train.fit(self._best_few(effects, base), free, base.starts, JOINT, tolerance=3e-3)
+            few = self._best_few(effects, base)
+            other = self.train.fit(few.fit.values, free, base.starts, JOINT, tolerance=3e-3)
             best = min(best, other, key=lambda fit: fit.cost)
-        return self.model(effects, best)
+        return self.model(effects, best), few
 
-    def _best_few(self, effects: Sequence[int], base: Fit) -> np.ndarray:
-        """Parameters after the kinds that lower the cost of every third window most have joined one by one.
+    def _best_few(self, effects: Sequence[int], base: Fit) -> Model:
+        """The kinds that lower the cost of every third window most join one by one.
 
         A kind joins at all its places at once: the joints of a machine are built alike.
         """
@@ -160,7 +155,7 @@ class Selector:
             best = min(fits, key=lambda k: fits[k].cost)
             chosen += kinds.pop(best)
             fit = fits[best]
-        return fit.values
+        return self.model(chosen, replace(fit, starts=base.starts), 2 * REFIT)
 
     def model(self, effects: Sequence[int], begin: Fit, iterations: int = REFIT) -> Model:
         """Fit a model from the optimum of another, without the effects that it lacks."""
@@ -257,148 +252,6 @@ class Selector:
             costs[e] = float(z @ np.linalg.pinv(inverse[np.ix_(rows, rows)]) @ z)
         return sorted(costs, key=lambda e: costs[e]), costs
 
-    def substitute(self, selection: Selection, screening: Screening) -> Selection:
-        """Try the likest other effects in the place of each kept one; keep the better, name those that do as well."""
-        current = self._alike_everywhere(selection.model, screening)
-        for e in current.effects:
-            others = self._likest(e, current.effects, screening)
-            best = e
-            alike: list[int] = []
-            for other in others:
-                self.say(f"{self.simulation.effects[e].label} or {self.simulation.effects[other].label}")
-                begin = self._translated(current, best, other)
-                trial = self.model([i for i in current.effects if i != best] + [other], begin, REFIT + 3)
-                if self._better(trial, current):
-                    current, alike, best = trial, [], other
-                elif not self._better(current, trial):
-                    alike.append(other)
-                    if self._simpler(other, best):
-                        current, best = trial, other
-            selection.alike[best] = sorted({e, *alike} - {best})
-        selection.model = current = self.simplest(current, selection, screening)
-        selection.alike = {
-            e: [i for i in found if i not in current.effects]
-            for e, found in selection.alike.items()
-            if e in current.effects
-        }
-        return selection
-
-    def merge(self, selection: Selection, screening: Screening) -> Selection:
-        """Try one effect in the place of two: the joint fit may have met its like by a mixture.
-
-        Far from the noise it is not worth its time: neither the two nor the one are right.
-        """
-        current = selection.model
-        if self.far(current):
-            return selection
-        pairs = sorted(combinations(current.effects, 2), key=lambda pair: -screening.cosine[pair])[:MERGES]
-        for pair in pairs:
-            rest = [e for e in current.effects if e not in pair]
-            if len(rest) != len(current.effects) - 2:
-                continue
-            without = self.model(rest, current.fit)
-            outside = [i for i in range(len(self.simulation.effects)) if i not in rest and screening.excited(i)]
-            outside = [i for i in outside if self.simulation.effects[i].kind != "declared"]
-            for one in self._promising(without, outside):
-                self.say(f"{self.simulation.effects[one].label} in the place of two")
-                trial = self.model([*rest, one], without.fit, REFIT + 3)
-                if not self.evidence(current, trial).clear(SEEMS):
-                    current = trial
-                    selection.alike[one] = [i for i in screening.alike(one) if i not in trial.effects]
-                    break
-        selection.model = current
-        return selection
-
-    def uniform(self, model: Model, selection: Selection, screening: Screening) -> Model:
-        """Try the kind that is kept most in the place of each odd one that it resembles: joints are built alike.
-
-        An odd one may have been chosen while the others were still wrong.
-        """
-        kind_of = [e.kind for e in self.simulation.effects]
-        count = Counter(kind_of[e] for e in model.effects)
-        for e in model.effects:
-            kind, places = count.most_common(1)[0]
-            same = [i for i, k in enumerate(kind_of) if k == kind and i not in model.effects and screening.excited(i)]
-            other = max(same, key=lambda i: screening.cosine[e, i], default=e)
-            if places < 2 or kind_of[e] == kind or screening.cosine[e, other] < LIKE:
-                continue
-            self.say(f"{self.simulation.effects[other].label}, as elsewhere")
-            begin = self._translated(model, e, other)
-            trial = self.led_on(self.model([i for i in model.effects if i != e] + [other], begin, REFIT + 3))
-            if self._better(trial, model):
-                model = trial
-                selection.alike[other] = sorted({*selection.alike.pop(e, [])} - {other})
-        return model
-
-    def simplest(self, model: Model, selection: Selection, screening: Screening) -> Model:
-        """Take the simpler ones of a class that do as well now that all else is right: richer ones win by trifles."""
-        for e in model.effects:
-            for other in sorted(screening.alike(e), key=lambda i: len(self.simulation.effects[i].parameters)):
-                if other in model.effects or not self._simpler(other, e):
-                    continue
-                self.say(f"{self.simulation.effects[other].label} is simpler")
-                begin = self._translated(model, e, other)
-                trial = self.model([i for i in model.effects if i != e] + [other], begin, REFIT + 3)
-                if self.train.exact and not self.far(model):
-                    trial = self.led_on(trial)
-                if not self._better(model, trial):
-                    model = trial
-                    selection.alike[other] = sorted({*selection.alike.pop(e, []), e} - {other})
-                    break
-        return model
-
-    def _alike_everywhere(self, model: Model, screening: Screening) -> Model:
-        """Try each kind in the place of all others that it resembles, at once: one alone may look no better."""
-        kind_of = [e.kind for e in self.simulation.effects]
-        for kind in sorted({*kind_of} - {"declared"}):
-            like = LIKE if kind in {kind_of[e] for e in model.effects} else AKIN
-            same = [i for i, k in enumerate(kind_of) if k == kind and screening.excited(i)]
-            if not same:
-                continue
-            nearest = {e: max(same, key=lambda i: screening.cosine[e, i]) for e in model.effects}
-            swaps = {e: i for e, i in nearest.items() if kind_of[e] != kind and screening.cosine[e, i] > like}
-            trial_effects = sorted({swaps.get(e, e) for e in model.effects})
-            if len(swaps) < 2 or len(trial_effects) < len(model.effects):
-                continue
-            self.say(f"{kind} in all places")
-            begin = model.fit
-            for old, new in swaps.items():
-                moved = self._translated(model, old, new).values[self.simulation.slices[new]]
-                begin = replace(begin, values=begin.values.copy(), linear=None)
-                begin.values[self.simulation.slices[new]] = moved
-            trial = self.model(trial_effects, begin, 2 * REFIT)
-            if self.evidence(trial, model).clear(SEEMS):
-                model = trial
-        return model
-
-    def _likest(self, effect: int, kept: Sequence[int], screening: Screening) -> list[int]:
-        """What to try in the place of an effect: kinds that are kept elsewhere first, as joints are built alike."""
-        kinds = {self.simulation.effects[i].kind for i in kept}
-        near = [i for i in np.argsort(-screening.cosine[effect]).tolist() if screening.cosine[effect, i] > LIKE]
-        near = [i for i in near if i != effect and i not in kept and screening.excited(i)]
-        return sorted(near, key=lambda i: self.simulation.effects[i].kind not in kinds)[:SUBSTITUTES]
-
-    def _translated(self, model: Model, old: int, new: int) -> Fit:
-        """Where to begin with ``new`` in the place of ``old``: where it does the likest, to first order."""
-        old_free, new_free = self.free([old]), self.free([new])
-        old_free, new_free = (f[~self.train.declared[f] & self.simulation.strength[f]] for f in (old_free, new_free))
-        normal = self.train.linear(model.fit, np.concatenate([old_free, new_free])).normal.sum(0)
-        k = len(old_free)
-        z = ((model.fit.values - self.simulation.null) / self.train.size)[old_free]
-        inner = normal[k:, k:] + (1e-6 * np.trace(normal[k:, k:]) + 1e-12) * np.eye(len(new_free))
-        values = model.fit.values.copy()
-        values[new_free] = self.simulation.null[new_free] + self.train.size[new_free] * np.linalg.solve(
-            inner, normal[k:, :k] @ z
-        )
-        return replace(model.fit, values=np.clip(values, self.train.lower, self.train.upper), linear=None)
-
-    def _better(self, a: Model, b: Model) -> bool:
-        """Whether one of two likes does better: near the noise that seems so soon, far from it it must be clear."""
-        return self.evidence(a, b).clear(*(self.limit(a) if self.far(a) else (SEEMS, GAIN)))
-
-    def _simpler(self, a: int, b: int) -> bool:
-        return len(self.simulation.effects[a].parameters) < len(self.simulation.effects[b].parameters)
-
     def judge(self, selection: Selection) -> Selection:
         """Evidence for each kept effect against the model without it; what is not clear goes."""
         selection = self.eliminate(selection)
@@ -426,7 +279,7 @@ class Selector:
             if np.median(current.errors) < ENOUGH:
                 break
             tried: list[tuple[float, Model, int]] = []
-            for e in self._promising(current, [c for c in candidates if c not in current.effects]):
+            for e in self.promising(current, [c for c in candidates if c not in current.effects]):
                 self.say(f"looking at {self.simulation.effects[e].label} again")
                 trial = self.model([*current.effects, e], current.fit, REFIT + 3)
                 evidence = self.evidence(trial, current)
@@ -438,7 +291,7 @@ class Selector:
             selection.dropped.pop(added, None)
         return selection
 
-    def _promising(self, model: Model, outside: Sequence[int]) -> list[int]:
+    def promising(self, model: Model, outside: Sequence[int]) -> list[int]:
         """The effects outside that lower the log errors or the cost most in a short fit to every third window."""
         some = np.arange(0, len(self.train.windows), 3)
         part, begin = self.train.on(some), model.fit.starts[some]

@@ -1,0 +1,180 @@
+"""Effects that could stand for one another: which of them a model keeps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from sb3_rpto.tracing.evidence import GAIN
+from sb3_rpto.tracing.identify import Fit
+from sb3_rpto.tracing.screen import Screening
+from sb3_rpto.tracing.select import REFIT, SEEMS, Model, Selection, Selector
+
+#: Iterations of a fit with one effect in the place of another.
+EXCHANGED = REFIT + 3
+#: Pairs of kept effects in whose place one is tried.
+MERGES = 3
+#: Candidates for a substitution are the likest so many, of at least this cosine; of a kind that is nowhere kept, which
+#: could stand in all places, at least the second.
+SUBSTITUTES, LIKE, AKIN = 5, 0.3, 0.6
+
+
+class Likes:
+    """Exchanges effects of a model for others that could stand for them.
+
+    :param selector: fits and compares the models
+    :param screening: what looks like what
+    """
+
+    def __init__(self, selector: Selector, screening: Screening) -> None:
+        self.selector, self.screening = selector, screening
+        self.effects = selector.simulation.effects
+        self.kinds = [effect.kind for effect in self.effects]
+
+    def substitute(self, selection: Selection) -> Selection:
+        """Try the likest other effects in the place of each kept one; keep the better, name those that do as well."""
+        current = self._kind_everywhere(selection.model)
+        for e in current.effects:
+            best, alike = e, list[int]()
+            for other in self._likest(e, current.effects):
+                self.selector.say(f"{self.effects[e].label} or {self.effects[other].label}")
+                trial = self._exchanged(current, best, other)
+                if self._better(trial, current):
+                    current, alike, best = trial, [], other
+                elif not self._better(current, trial):
+                    alike.append(other)
+                    if self._simpler(other, best):
+                        current, best = trial, other
+            selection.alike[best] = sorted({e, *alike} - {best})
+        selection.model = current = self.simplest(current, selection)
+        selection.alike = {
+            e: [i for i in found if i not in current.effects]
+            for e, found in selection.alike.items()
+            if e in current.effects
+        }
+        return selection
+
+    def merge(self, selection: Selection) -> Selection:
+        """Try one effect in the place of two: the joint fit may have met its like by a mixture.
+
+        Far from the noise it is not worth its time: neither the two nor the one are right.
+        """
+        current, selector = selection.model, self.selector
+        if selector.far(current):
+            return selection
+        pairs = sorted(combinations(current.effects, 2), key=lambda pair: -self.screening.cosine[pair])[:MERGES]
+        for pair in pairs:
+            rest = [e for e in current.effects if e not in pair]
+            if len(rest) != len(current.effects) - 2:
+                continue
+            without = selector.model(rest, current.fit)
+            outside = [i for i in range(len(self.effects)) if i not in rest and self.screening.excited(i)]
+            outside = [i for i in outside if self.kinds[i] != "declared"]
+            for one in selector.promising(without, outside):
+                selector.say(f"{self.effects[one].label} in the place of two")
+                trial = selector.model([*rest, one], without.fit, EXCHANGED)
+                if not selector.evidence(current, trial).clear(SEEMS):
+                    current = trial
+                    selection.alike[one] = [i for i in self.screening.alike(one) if i not in trial.effects]
+                    break
+        selection.model = current
+        return selection
+
+    def uniform(self, model: Model, selection: Selection) -> Model:
+        """Try the kind that is kept most in the place of each odd one that it resembles: joints are built alike.
+
+        An odd one may have been chosen while the others were still wrong.
+        """
+        count = Counter(self.kinds[e] for e in model.effects)
+        for e in model.effects:
+            kind, places = count.most_common(1)[0]
+            same = [i for i in self._excited(kind) if i not in model.effects]
+            other = max(same, key=lambda i: self.screening.cosine[e, i], default=e)
+            if places < 2 or self.kinds[e] == kind or self.screening.cosine[e, other] < LIKE:
+                continue
+            self.selector.say(f"{self.effects[other].label}, as elsewhere")
+            trial = self.selector.led_on(self._exchanged(model, e, other))
+            if self._better(trial, model):
+                model = trial
+                selection.alike[other] = sorted({*selection.alike.pop(e, [])} - {other})
+        return model
+
+    def simplest(self, model: Model, selection: Selection) -> Model:
+        """Take the simpler ones of a class that do as well now that all else is right: richer ones win by trifles."""
+        for e in model.effects:
+            for other in sorted(self.screening.alike(e), key=lambda i: len(self.effects[i].parameters)):
+                if other in model.effects or not self._simpler(other, e):
+                    continue
+                self.selector.say(f"{self.effects[other].label} is simpler")
+                trial = self._exchanged(model, e, other)
+                if self.selector.train.exact and not self.selector.far(model):
+                    trial = self.selector.led_on(trial)
+                if not self._better(model, trial):
+                    model = trial
+                    selection.alike[other] = sorted({*selection.alike.pop(e, []), e} - {other})
+                    break
+        return model
+
+    def _kind_everywhere(self, model: Model) -> Model:
+        """Try each kind in the place of all others that it resembles, at once: one alone may look no better."""
+        for kind in sorted({*self.kinds} - {"declared"}):
+            like = LIKE if kind in {self.kinds[e] for e in model.effects} else AKIN
+            same = self._excited(kind)
+            if not same:
+                continue
+            nearest = {e: max(same, key=lambda i: self.screening.cosine[e, i]) for e in model.effects}
+            swaps = {e: i for e, i in nearest.items() if self.kinds[e] != kind and self.screening.cosine[e, i] > like}
+            trial_effects = sorted({swaps.get(e, e) for e in model.effects})
+            if len(swaps) < 2 or len(trial_effects) < len(model.effects):
+                continue
+            self.selector.say(f"{kind} in all places")
+            begin = model.fit
+            for old, new in swaps.items():
+                moved = self._translated(model, old, new).values[self.selector.simulation.slices[new]]
+                begin = replace(begin, values=begin.values.copy(), linear=None)
+                begin.values[self.selector.simulation.slices[new]] = moved
+            trial = self.selector.model(trial_effects, begin, 2 * REFIT)
+            if self.selector.evidence(trial, model).clear(SEEMS):
+                model = trial
+        return model
+
+    def _excited(self, kind: str) -> list[int]:
+        """The places of a kind that the data could show."""
+        return [i for i, k in enumerate(self.kinds) if k == kind and self.screening.excited(i)]
+
+    def _likest(self, effect: int, kept: Sequence[int]) -> list[int]:
+        """What to try in the place of an effect: kinds that are kept elsewhere first, as joints are built alike."""
+        kinds, cosine = {self.kinds[i] for i in kept}, self.screening.cosine[effect]
+        near = [i for i in np.argsort(-cosine).tolist() if cosine[i] > LIKE]
+        near = [i for i in near if i != effect and i not in kept and self.screening.excited(i)]
+        return sorted(near, key=lambda i: self.kinds[i] not in kinds)[:SUBSTITUTES]
+
+    def _exchanged(self, model: Model, old: int, new: int) -> Model:
+        """The model with ``new`` in the place of ``old``, fitted."""
+        rest = [i for i in model.effects if i != old]
+        return self.selector.model([*rest, new], self._translated(model, old, new), EXCHANGED)
+
+    def _translated(self, model: Model, old: int, new: int) -> Fit:
+        """Where to begin with ``new`` in the place of ``old``: where it does the likest, to first order."""
+        train, simulation = self.selector.train, self.selector.simulation
+        old_free, new_free = self.selector.free([old]), self.selector.free([new])
+        old_free, new_free = (f[~train.declared[f] & simulation.strength[f]] for f in (old_free, new_free))
+        normal = train.linear(model.fit, np.concatenate([old_free, new_free])).normal.sum(0)
+        k = len(old_free)
+        z = ((model.fit.values - simulation.null) / train.size)[old_free]
+        inner = normal[k:, k:] + (1e-6 * np.trace(normal[k:, k:]) + 1e-12) * np.eye(len(new_free))
+        values = model.fit.values.copy()
+        values[new_free] = simulation.null[new_free] + train.size[new_free] * np.linalg.solve(inner, normal[k:, :k] @ z)
+        return replace(model.fit, values=np.clip(values, train.lower, train.upper), linear=None)
+
+    def _better(self, a: Model, b: Model) -> bool:
+        """Whether one of two likes does better: near the noise that seems so soon, far from it it must be clear."""
+        far = self.selector.far(a)
+        return self.selector.evidence(a, b).clear(*(self.selector.limit(a) if far else (SEEMS, GAIN)))
+
+    def _simpler(self, a: int, b: int) -> bool:
+        return len(self.effects[a].parameters) < len(self.effects[b].parameters)

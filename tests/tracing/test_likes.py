@@ -1,0 +1,57 @@
+"""Exchanges of effects that could stand for one another, on small problems with a known answer."""
+
+import pytest
+from simulated import compiled, problem, recorded
+
+from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction, ViscousFriction
+from sb3_rpto.tracing.likes import Likes
+from sb3_rpto.tracing.screen import screen
+from sb3_rpto.tracing.select import THRESHOLD, Selection, Selector
+
+
+def test_substitution_replaces_a_wrong_effect_by_the_right_one() -> None:
+    effects: list[Effect] = [CoulombFriction("hinge"), ViscousFriction("hinge")]
+    planted = [CoulombFriction("hinge", level=0.08)]
+    train, unseen = (problem(effects, recorded(planted, seed=seed)) for seed in (2, 102))
+    s = Selector(train, unseen, THRESHOLD, lambda what: None)
+    nothing = train.score(train.null)
+    wrong = s.model([1], nothing, 12)
+    assert Likes(s, screen(train, nothing)).substitute(Selection(wrong)).model.effects == (0,)
+
+
+def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
+    """A Stribeck friction that has come near a Coulomb's path errs less than a Coulomb's first fit."""
+    effects: list[Effect] = [CoulombFriction("hinge"), StribeckFriction("hinge")]
+    data = recorded([CoulombFriction("hinge", level=0.08)], noise=0.0, exact=True)
+    s = Selector(problem(effects, data, noise=1e-5), None, THRESHOLD, lambda what: None)
+    assert s.train.exact
+    found = screen(s.train, s.model((), s.train.score(s.train.null)).fit)
+    assert found.alike(1) == [0]
+    rich = s.led_on(s.model([1], s.train.fit(s.train.null, s.free([1]))))
+    assert not s.far(rich)
+    assert Likes(s, found).simplest(rich, Selection(rich)).effects == (0,)
+
+
+#: three links, of which a motor drives the first
+LINK = """<body pos="0 0 -.3"><joint name="{0}" axis="0 -1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="{1}"/>"""
+CHAIN = f"""<mujoco><option timestep="0.005" integrator="RK4"><flag contact="disable"/></option><worldbody>
+{LINK.format("one", 0.4)}{LINK.format("two", 0.3)}{LINK.format("three", 0.2)}</body></body></body></worldbody>
+<actuator><motor name="motor" joint="one"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("kept", [(0, 1, 5), (3, 4, 5)])
+def test_joints_are_built_alike(kept: tuple[int, ...]) -> None:
+    """Dry friction at three joints: one odd kind is made like the others, three wrong ones are made right at once."""
+    joints, model = ("one", "two", "three"), compiled(CHAIN)
+    effects: list[Effect] = [kind(j) for kind in (CoulombFriction, ViscousFriction) for j in joints]
+    there = [CoulombFriction(j, level=level) for j, level in zip(joints, (0.1, 0.06, 0.03))]
+    data = recorded(there, model, noise=0.0, exact=True)
+    s = Selector(problem(effects, data, noise=1e-5, model=model), None, THRESHOLD, lambda what: None)
+    found = screen(s.train, s.model((), s.train.score(s.train.null)).fit)
+    wrong = s.model(kept, s.train.fit(s.train.null, s.free(kept)))
+    if 0 in kept:
+        assert Likes(s, found).uniform(wrong, Selection(wrong)).effects == (0, 1, 2)
+    else:
+        assert Likes(s, found).substitute(Selection(wrong)).model.effects == (0, 1, 2)
