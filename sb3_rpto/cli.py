@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import importlib
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -110,7 +111,12 @@ def _add_trace(commands: Commands) -> None:
         "--candidates", metavar="K1,K2", type=_names, help="kinds of effects to look for (default: all in the library)"
     )
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the split and the resampling (default: 0)")
-    parser.add_argument("--horizon", metavar="S", type=float, help="length of a prediction window in s (default: 0.5)")
+    parser.add_argument(
+        "--horizon",
+        metavar="S",
+        type=float,
+        help="length of a prediction window in s (default: 0.5, or 0.8 under 15 s of data)",
+    )
     parser.add_argument(
         "--calibrate",
         metavar="N",
@@ -139,6 +145,8 @@ def _trace(parsed: argparse.Namespace) -> int:
     model = _model(parsed.model)
     data = _recordings(parsed.files, parsed.format)
     parsed.out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=parsed.out):
+        pass  # can be written to
     with _progress(parsed.quiet) as progress:
         report = trace(
             model,
@@ -150,8 +158,10 @@ def _trace(parsed: argparse.Namespace) -> int:
             calibrate=parsed.calibrate,
             progress=progress,
         )
+    print(report.verdict if parsed.quiet else report)  # before it is written: what fails there must not lose it
     report.save(parsed.out)
-    print(report.verdict if parsed.quiet else f"{report}\n\nwritten: {parsed.out / 'report.html'}")
+    if not parsed.quiet:
+        print(f"\nwritten: {parsed.out / 'report.html'}")
     return 0
 
 

@@ -18,6 +18,8 @@ from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_e
 from sb3_rpto.dynamics.onestep import OneStep, Steps, as_steps, true_state
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.effect import from_json
+from sb3_rpto.effects.mjcf import PlainModel
+from sb3_rpto.effects.model import load_model
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.effects.wrapper import CorrectedEnv, beyond_model
 from sb3_rpto.envs.observations import StateMap, env_name, layers, mujoco_model, single_env, state_map
@@ -49,7 +51,9 @@ def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
     frame_skip = getattr(single.unwrapped, "frame_skip", None)
     if frame_skip is None:
         raise ValueError(f"{env_name(single)} has no frame_skip; derive it from gymnasium.envs.mujoco.MujocoEnv")
-    return {"model": model.__copy__(), "recover": recover, "frame_skip": int(frame_skip)}
+    spec, _ = load_model(single)
+    plain = model.__copy__() if spec is None else PlainModel.of(spec, model)  # nothing tells the MJCF of some
+    return {"model": plain, "recover": recover, "frame_skip": int(frame_skip)}
 
 
 def check_commands(env: gym.Env, what: str) -> None:
@@ -115,7 +119,7 @@ class PhysicalDynamics(Dynamics):
         observation_space: spaces.Box,
         action_space: spaces.Box,
         *,
-        model: mujoco.MjModel,
+        model: mujoco.MjModel | PlainModel,
         recover: StateMap,
         frame_skip: int,
         declared: Sequence[str] = (),
@@ -133,6 +137,8 @@ class PhysicalDynamics(Dynamics):
         ):
             if not value >= least:
                 raise ValueError(f"{name} must be at least {least:g}, not {value!r}")
+        if isinstance(model, PlainModel):
+            model = model.compile()
         if action_space.shape != (model.nu,):
             raise ValueError(f"action_space has shape {action_space.shape}, the model {model.nu} actuators")
         self.model, self.recover, self.frame_skip = model, recover, frame_skip

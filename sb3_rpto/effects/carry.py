@@ -18,10 +18,11 @@ import numpy as np
 
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import LIBRARY, Effect, from_json
-from sb3_rpto.effects.mjcf import write_mjcf
-from sb3_rpto.effects.model import ModelSource, load_model, numbers, same_layout, set_number
+from sb3_rpto.effects.mjcf import restore, rounded, write_mjcf
+from sb3_rpto.effects.model import ModelSource, load_model
 from sb3_rpto.effects.names import near
 from sb3_rpto.effects.simulation import Simulation, prepare
+from sb3_rpto.effects.units import unit_at
 from sb3_rpto.effects.world import LiveWorld
 from sb3_rpto.effects.wrapper import CorrectedEnv, active, own
 
@@ -98,8 +99,8 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
         "format": FORMAT,
         "mujoco": mujoco.__version__,
         "model": {"file": "model.xml", "sha256": hashlib.sha256(text.encode()).hexdigest()},
-        "effects": [_describe(effect) for effect in own(effects, nominal)],
-        "exact": _exact(mujoco.MjModel.from_xml_string(text, assets), model),
+        "effects": [_describe(effect, nominal) for effect in own(effects, nominal)],
+        "exact": rounded(mujoco.MjModel.from_xml_string(text, assets), model),
     }
     folder = Path(folder)
     (folder / "assets" if assets else folder).mkdir(parents=True, exist_ok=True)
@@ -138,15 +139,14 @@ def load_corrected(folder: str | os.PathLike[str]) -> Corrected:
             stacklevel=2,
         )
     model = mujoco.MjModel.from_xml_path(str(xml))
-    for name, entry in stored["exact"].items():
-        set_number(model, name, entry["index"], entry["value"])
+    restore(model, stored["exact"])
     return Corrected(model, [_rebuild(entry, model) for entry in stored["effects"]])
 
 
-def _describe(effect: Effect) -> dict[str, Any]:
+def _describe(effect: Effect, model: mujoco.MjModel) -> dict[str, Any]:
     entry = effect.to_json()
     entry["values"] = {name: float(value) for name, value in entry["values"].items()}
-    entry["unit"] = {p.name: p.unit for p in effect.parameters}
+    entry["unit"] = {p.name: unit_at(effect, p.unit, model) for p in effect.parameters}
     entry["equation"] = effect.equation
     entry["carried_by"] = carried_by(effect)
     if isinstance(effect, Declared):
@@ -164,18 +164,6 @@ def _rebuild(entry: Mapping[str, Any], model: mujoco.MjModel) -> Effect:
             "its class, decorated with @sb3_rpto.effects.register, before loading"
         )
     return from_json(entry)
-
-
-def _exact(compiled: mujoco.MjModel, model: mujoco.MjModel) -> dict[str, dict[str, list[Any]]]:
-    """The numbers of ``model`` that differ in ``compiled``, by flat index."""
-    if not same_layout(compiled, model):
-        raise ValueError("the MJCF that MuJoCo writes for this model compiles to another layout; name all its objects")
-    theirs, found = numbers(compiled), {}
-    for name, ours in numbers(model).items():
-        index = np.flatnonzero(ours.reshape(-1) != theirs[name].reshape(-1))
-        if len(index):
-            found[name] = {"index": index.tolist(), "value": ours.reshape(-1)[index].tolist()}
-    return found
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -62,7 +62,8 @@ def _write_mass(world: World, body: int, values: np.ndarray, nominal: float) -> 
 
 
 def _write_inertia(world: World, body: int, values: np.ndarray, nominal: float) -> None:
-    world.field("body_inertia")[:, body] *= (values / nominal)[:, None]
+    inertia = world.field("body_inertia")[:, body]
+    inertia *= (values / inertia[:, 0])[:, None]
 
 
 def _write_kp(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
@@ -159,9 +160,11 @@ class Declared(Effect):
     """One number of the model that its user declared unknown, e.g. ``hinge.damping``; its null is the nominal value.
 
     ``range`` is the width of a joint's limits, about the point in them that is nearest to the reference pose;
-    ``mass`` scales the inertia with it, ``inertia`` leaves the mass, ``length`` is that of a link: its capsules and
-    the offsets of its children, at constant density (see :mod:`sb3_rpto.effects.length`); ``kp`` is the stiffness of
-    a position servo, ``strength`` a factor on all that an actuator does (gain, bias and force limits).
+    ``length`` is that of a link: its capsules and the offsets of its children, at constant density (see
+    :mod:`sb3_rpto.effects.length`); ``mass`` scales the inertia with it, and is that at the nominal length where
+    the length is declared too; ``inertia`` is the first principal moment, the others in proportion, at whatever mass;
+    ``kp`` is the stiffness of a position servo, ``strength`` a factor on all that an actuator does (gain, bias and
+    force limits).
 
     :param model: the model that has it
     :param name: ``<object>.<parameter>``, with ``joint:`` (``body:``, ``geom:``, ``actuator:``) before the object
@@ -210,6 +213,11 @@ class Declared(Effect):
     def label(self) -> str:
         """The parameter's name."""
         return self.parameters[0].name
+
+    @property
+    def rank(self) -> int:
+        """Its turn among declared parameters: what changes a mass or an inertia besides comes before these."""
+        return {"mass": 1, "inertia": 2}.get(self.label.rpartition(".")[2], 0)
 
     def __repr__(self) -> str:
         return f"{self.label} = {self.values[0]:.4g} {self.parameters[0].unit}".rstrip()

@@ -4,12 +4,42 @@ from __future__ import annotations
 
 import hashlib
 import os
+from dataclasses import dataclass
 from pathlib import Path, PurePath
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.model import numbers
+from sb3_rpto.effects.model import numbers, same_layout, set_number
+
+Rounded: TypeAlias = dict[str, dict[str, list[Any]]]
+
+
+@dataclass(frozen=True)
+class PlainModel:
+    """A compiled model as text and numbers, which another version of MuJoCo reads, too.
+
+    :param text: MJCF
+    :param assets: contents of the files that it refers to
+    :param exact: see :func:`rounded`
+    """
+
+    text: str
+    assets: dict[str, bytes]
+    exact: Rounded
+
+    @classmethod
+    def of(cls, spec: mujoco.MjSpec, model: mujoco.MjModel) -> PlainModel:
+        """The text of a model; parameters as those of :func:`write_mjcf`."""
+        text, assets = write_mjcf(spec, model)
+        return cls(text, assets, rounded(mujoco.MjModel.from_xml_string(text, assets), model))
+
+    def compile(self) -> mujoco.MjModel:
+        """The model, to the last bit of its numbers."""
+        model = mujoco.MjModel.from_xml_string(self.text, self.assets)
+        restore(model, self.exact)
+        return model
 
 
 def write_mjcf(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[str, dict[str, bytes]]:
@@ -32,6 +62,27 @@ def write_mjcf(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[str, dict[st
     assets = _gather(spec)
     spec.compile()
     return spec.to_xml(), assets
+
+
+def rounded(compiled: mujoco.MjModel, model: mujoco.MjModel) -> Rounded:
+    """The numbers of ``model`` that differ in what its MJCF compiles to: flat indices and values by field.
+
+    :raises ValueError: it compiles to other objects
+    """
+    if not same_layout(compiled, model):
+        raise ValueError("the MJCF that MuJoCo writes for this model compiles to another layout; name all its objects")
+    theirs, found = numbers(compiled), {}
+    for name, ours in numbers(model).items():
+        index = np.flatnonzero(ours.reshape(-1) != theirs[name].reshape(-1))
+        if len(index):
+            found[name] = {"index": index.tolist(), "value": ours.reshape(-1)[index].tolist()}
+    return found
+
+
+def restore(model: mujoco.MjModel, exact: Rounded) -> None:
+    """Write what :func:`rounded` found into the compiled model."""
+    for name, entry in exact.items():
+        set_number(model, name, entry["index"], entry["value"])
 
 
 def _tell_inertia(spec: mujoco.MjSpec, compiled: mujoco.MjModel) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -13,6 +14,9 @@ from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.world import BatchWorld, World
+
+#: Actuators whose own state follows the command with a time constant, ``dynprm[0]``.
+FILTERS = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{name}")) for name in ("FILTER", "FILTEREXACT", "MUSCLE"))
 
 
 class Drive(NamedTuple):
@@ -87,18 +91,19 @@ class Simulation:
             for effect, s in zip(self.effects, self.slices)
             if isinstance(effect, Declared) or np.any((values[:, s] != self.null[s])[:, self.strength[s]])
         ]
-        commands = filter_commands(active, drive.commands, self.model.opt.timestep)[:, drive.before :]
+        commands = filter_commands(active, drive.commands, self.model.opt.timestep)
         world.restore()
         world.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        for name, setting in drive.settings.items():
-            self._setting(name).write(world, setting[:, None])
+        self.set(world, drive.settings)
         prepare(world, active)
-        world.qpos[:], world.qvel[:] = qpos, qvel
         out_q = np.empty((n, steps + 1, self.model.nq))
         out_v = np.empty((n, steps + 1, self.model.nv))
         out_q[:, 0], out_v[:, 0] = qpos, qvel
         with quiet():
-            self._run(world, active, commands, drive.enabled, out_q, out_v)
+            if self.model.na or self.model.nhistory:
+                self._lead(world, commands[:, : drive.before], qpos, qvel)
+            world.qpos[:], world.qvel[:] = qpos, qvel
+            self._run(world, active, commands[:, drive.before :], drive.enabled, out_q, out_v)
         bad = ~(np.isfinite(out_q).all(-1) & (np.abs(out_v) < 1e6).all(-1))
         if bad.any():
             bad = np.maximum.accumulate(bad, axis=1)
@@ -135,6 +140,15 @@ class Simulation:
             for i in np.flatnonzero(world.batch.warning[:, :, 1].any(axis=1)):
                 out_q[i, (out_q[i] == out_q[i, -1]).all(axis=-1)] = np.nan
 
+    def _lead(self, world: BatchWorld, past: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Lead the actuators' own filters and delays through the commands before the start, the motion held there."""
+        if not past.shape[1]:
+            return
+        world.batch.bind("act")[:] = settled(self.model, past[:, 0])
+        for k in range(past.shape[1]):
+            world.qpos[:], world.qvel[:], world.ctrl[:] = qpos, qvel, past[:, k]
+            world.batch.step()
+
     def _world(self, n: int) -> BatchWorld:
         if n not in self._worlds:
             if len(self._worlds) >= 4:
@@ -142,10 +156,13 @@ class Simulation:
             self._worlds[n] = BatchWorld(self.model, n, self.nthread)
         return self._worlds[n]
 
-    def _setting(self, name: str) -> Declared:
-        if name not in self._settings:
-            self._settings[name] = Declared(self.model, name, (-np.inf, np.inf))
-        return self._settings[name]
+    def set(self, world: World, settings: Mapping[str, np.ndarray]) -> None:
+        """Write parameters that are known of each simulation, by declared name, (n,)."""
+        for name in settings:
+            if name not in self._settings:
+                self._settings[name] = Declared(self.model, name, (-np.inf, np.inf))
+        for name in sorted(settings, key=lambda name: self._settings[name].rank):
+            self._settings[name].write(world, settings[name][:, None])
 
 
 Active = Sequence[tuple[Effect, np.ndarray]]
@@ -165,7 +182,7 @@ def quiet() -> Iterator[None]:
 
 def prepare(world: World, active: Active) -> None:
     """Write what the effects change of the model: numbers that were declared first, additions after."""
-    for effect, x in sorted(active, key=lambda pair: not isinstance(pair[0], Declared)):
+    for effect, x in sorted(active, key=lambda pair: pair[0].rank if isinstance(pair[0], Declared) else math.inf):
         effect.write(world, x)
     world.settle()
 
@@ -198,7 +215,7 @@ class Switch:
 
     FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_damping", "actuator_dampingpoly")
 
-    def __init__(self, world: BatchWorld, enabled: np.ndarray | None) -> None:
+    def __init__(self, world: World, enabled: np.ndarray | None) -> None:
         self.world, self.enabled = world, enabled
         if enabled is not None:
             self.on = {name: world.field(name).copy() for name in self.FIELDS}
@@ -212,8 +229,20 @@ class Switch:
         for name, on in self.on.items():
             mask = self.last.reshape(*self.last.shape, *[1] * (on.ndim - 2))
             self.world.field(name)[:] = on * mask
-        # The damping of actuators reaches the joints through derived constants.
-        self.world.batch.set_const()
+        self.world.derive()  # the damping of actuators reaches the joints through derived constants
+
+
+def settled(model: mujoco.MjModel, ctrl: np.ndarray) -> np.ndarray:
+    """The actuators' own states after a command has held for long: filters end at it.
+
+    :param ctrl: (n, nu)
+    :return: (n, na)
+    """
+    act = np.zeros((len(ctrl), model.na))
+    for i in np.flatnonzero(np.isin(model.actuator_dyntype, FILTERS)):
+        low, high = model.actuator_ctrlrange[i] if model.actuator_ctrllimited[i] else (-np.inf, np.inf)
+        act[:, model.actuator_actadr[i]] = np.clip(ctrl[:, i], low, high)
+    return act
 
 
 def names_of(model: mujoco.MjModel, qpos: Sequence[str]) -> np.ndarray:

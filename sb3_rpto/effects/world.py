@@ -56,15 +56,15 @@ class World(ABC):
     def settle(self) -> None:
         """Derive the constants that follow from the fields, and keep the level of dry friction."""
         if any(name in _DERIVING for name in self._nominal):
-            self._set_const()
+            self.derive()
         self._dry[:] = False
         self._base_friction = None
         if "dof_frictionloss" in self._nominal:
             self._base_friction = self._live("dof_frictionloss").copy()
 
     @abstractmethod
-    def _set_const(self) -> None:
-        """mj_setConst in every simulation."""
+    def derive(self) -> None:
+        """Derive the constants that follow from the fields (mj_setConst) in every simulation."""
 
     def rough(self, dof: int) -> None:
         """Make a joint ready for dry friction that holds: the stiffest constraint that the time step allows.
@@ -108,7 +108,8 @@ class BatchWorld(World):
     def _live(self, name: str) -> np.ndarray:
         return self.batch.expand(name)
 
-    def _set_const(self) -> None:
+    def derive(self) -> None:
+        """As in :class:`World`."""
         self.batch.set_const()
 
     def _applied(self) -> np.ndarray:
@@ -154,7 +155,8 @@ class LiveWorld(World):
         for name, value in self._numbers.items():
             setattr(self.model.opt, name.removeprefix("opt."), value.item())
 
-    def _set_const(self) -> None:
+    def derive(self) -> None:
+        """As in :class:`World`."""
         # mj_setConst writes the data at the reference pose: a scratch copy keeps the environment where it is.
         mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
 

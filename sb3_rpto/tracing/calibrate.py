@@ -36,7 +36,8 @@ def largest_t(selector: Selector, base: Fit, chosen: list[int], seed: int) -> fl
     select = None if selector.select is None else _complete(selector.select, selector.select.score(base.values), rng)
     ghost = Selector(train, select, selector.threshold, selector.say, selector.horizon)
     nothing = ghost.model((), base)
-    outcome = ghost.eliminate(Selection(ghost.together(chosen, nothing.fit)), np.inf)
+    joint, _ = ghost.together(chosen, nothing.fit)
+    outcome = ghost.eliminate(Selection(joint), np.inf)
     found = [e.t for _, e in outcome.dropped.values() if isinstance(e, Evidence) and e.gain > 0]
     return max(found, default=0.0)
 

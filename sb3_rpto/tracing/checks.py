@@ -80,6 +80,17 @@ def unwrap(angle: np.ndarray) -> tuple[np.ndarray, int]:
     return angle - turn * np.concatenate([[0.0], np.cumsum(jumps)]), count
 
 
+def align_quaternions(quaternions: np.ndarray) -> int:
+    """Give neighbouring samples the sign that makes them near: q and -q are one orientation, differences are not.
+
+    :param quaternions: (T, 4), changed in place
+    :return: number of changes of sign undone
+    """
+    opposite = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
+    quaternions[1:] *= np.where(np.cumsum(opposite) % 2, -1.0, 1.0)[:, None]
+    return int(opposite.sum())
+
+
 def smoothed_velocity(time: np.ndarray, position: np.ndarray, window: int = WINDOW) -> np.ndarray:
     """Differentiate a position on the run's own clock with a cubic Savitzky-Golay filter.
 

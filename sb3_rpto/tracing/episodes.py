@@ -157,6 +157,16 @@ def repair(run: Episode, columns: Columns, findings: list[Finding]) -> list[Epis
     return pieces
 
 
+def _quaternions(columns: Columns) -> list[tuple[str, int]]:
+    """Ball and free joints, and where their quaternions begin among the position columns."""
+    found = []
+    for joint in dict.fromkeys(map(joint_of, columns.qpos)):
+        count = sum(joint_of(name) == joint for name in columns.qpos)
+        if count in (4, 7):
+            found.append((joint, columns.qpos.index(f"{joint}.{count - 4}")))
+    return found
+
+
 def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> None:
     """Check and repair, in place, the channels of an episode that is not yet handed out."""
 
@@ -170,6 +180,10 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
             "jitter",
             f"steps vary by {spread:.0%} around their median of {np.median(np.diff(time)):.4g} s; kept as they are",
         )
+    for joint, first in _quaternions(columns):
+        flips = checks.align_quaternions(episode.qpos[:, first : first + 4])
+        if flips:
+            say("quaternion sign", f"{flips} change(s) between q and -q, one orientation; aligned", f"qpos.{joint}")
     for i, name in enumerate(columns.qpos):
         # A turn means nothing to the coordinates of a ball or free joint.
         if name != joint_of(name):

@@ -9,7 +9,7 @@ import numpy as np
 from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.tracing.identify import TRUST, Problem
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.windows import Windows, cut
+from sb3_rpto.tracing.windows import Windows, cut, first_sample
 
 #: Horizons in s; the whole run comes after them.
 HORIZONS = (0.1, 0.5, 1.0)
@@ -107,8 +107,7 @@ def whole_runs(
     differences = []
     for e in data.episodes:
         one = replace(data, episodes=[e])
-        start = 0 if data.exact else 12
-        length = float(e.time[-1] - e.time[min(start, len(e) - 2)]) * 0.999
+        length = float(e.time[-1] - e.time[first_sample(simulation.model, e, data.exact)]) * 0.999
         try:
             windows = cut(simulation.model, one, sigma, length, 1)
         except ValueError:

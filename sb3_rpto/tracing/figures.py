@@ -140,8 +140,9 @@ def errors_by_horizon(report: Report) -> Picture | None:
     )
     caption += left_out(len(joints), len(shown))
     at = _middle(report.before)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        factor = float(np.exp(np.nanmean(np.log(report.before[at].rmse / report.after[at].rmse))))
+    least = 1e-12  # exact data can be met exactly
+    ratios = np.maximum(report.before[at].rmse, least) / np.maximum(report.after[at].rmse, least)
+    factor = float(np.exp(np.mean(np.log(ratios))))
     if factor > 1.05:
         change = f"err {factor:.3g} times less after the correction"
     else:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from sb3_rpto.effects import Declared
 from sb3_rpto.effects.carry import carried_by
+from sb3_rpto.effects.units import unit_at
 from sb3_rpto.tracing import causes, figures, wording
 from sb3_rpto.tracing.figures import Picture, horizon_label
 from sb3_rpto.version import __version__
@@ -96,11 +97,12 @@ def _verdict(report: Report) -> str:
     before, after = report.adequacy_before, report.adequacy_after
     idle = sum(c.status == "not excited" for c in report.candidates)
     verdict = f"<b>{escape(report.verdict.capitalize())}.</b> {escape(means)}<br>{escape(caution)}"
+    apart = "that were not fitted" if report.judged_apart else "that were fitted, as too few runs are set apart"
     ratios = [f"<b>{escape(str(a).removeprefix('R = '))}</b>" for a in (before, after)]
     lines = [
         f'<div class="verdict">{verdict}</div>',
         f"<p>Typical error over that of measurement noise alone (R, 1 where nothing is missing): {ratios[0]} before "
-        f"and {ratios[1]} after the correction, on windows that were not fitted.</p>",
+        f"and {ratios[1]} after the correction, on windows {apart}.</p>",
     ]
     if idle:
         lines.append(
@@ -124,7 +126,7 @@ def _model(report: Report) -> str:
         nominal = float(t.effect.nominal) if isinstance(t.effect, Declared) else float("nan")
         for p, value, (low, high) in zip(t.effect.parameters, t.effect.values, t.interval.T):
             change = wording.percent(value / nominal - 1) if nominal else "–"
-            unit = wording.unit_at(t.effect, p.unit, report.simulation.model)
+            unit = unit_at(t.effect, p.unit, report.simulation.model)
             row = [t.label, wording.number(value), wording.interval(low, high), unit, wording.number(nominal), change]
             rows.append(row)
     header = ["declared parameter", "fitted", "95 % interval", "unit", "in the file", "change"]
@@ -144,7 +146,7 @@ def _effects(report: Report) -> str:
         ]
         rows = []
         for p, value, (low, high) in zip(t.effect.parameters, t.effect.values, t.interval.T):
-            unit = wording.unit_at(t.effect, p.unit, report.simulation.model)
+            unit = unit_at(t.effect, p.unit, report.simulation.model)
             rows.append([p.name, wording.number(value), wording.interval(low, high), unit])
         lines += [_table(["parameter", "value", "95 % interval", "unit"], rows, numbers=(1, 2)), _evidence(report, t)]
     return "\n".join(lines)

@@ -107,7 +107,7 @@ class Problem:
         self.null = simulation.null
         self.declared = np.array([e.kind == "declared" for e in simulation.effects for _ in e.parameters], dtype=bool)
         self.moving = np.flatnonzero((windows.spread > 0).any(axis=0))  # coordinates of the start that are free
-        self.exact = not len(self.moving)  # as a simulator's data are
+        self.exact = windows.exact
         self.sensors = [(e, s) for e, s in zip(simulation.effects, simulation.slices) if e.senses]
 
     def on(self, index: np.ndarray) -> Problem:
@@ -171,6 +171,13 @@ class Problem:
         """Root mean squared residual of each window, (W,), from (W, S m)."""
         counts = self.windows.usable.sum(axis=1) * self.windows.measured.shape[2]
         return np.sqrt((residuals**2).sum(axis=1) / counts)
+
+    def unstable(self, values: np.ndarray) -> int:
+        """Number of windows whose simulation blows up, from the smoothed starts."""
+        count = len(self.windows)
+        starts = np.zeros((count, 2 * self.simulation.model.nv))
+        predicted = self.predict(np.tile(values, (count, 1)), starts, np.arange(count))
+        return int((~np.isfinite(predicted)).any(axis=(1, 2)).sum())
 
     # --- derivatives --------------------------------------------------------------------------------------------
 
@@ -248,9 +255,10 @@ class Problem:
         :param starts: as in :class:`Fit`; default: the smoothed states
         :param iterations: most steps
         :param tolerance: stop when the cost falls by less than this share
-        :return: never worse than where it began
+        :return: never worse than where it began, if that is within the bounds
         """
         values, damping, linear = values.copy(), 1e-3, None
+        values[free] = np.clip(values[free], self.lower[free], self.upper[free])
         starts = np.zeros((len(self.windows), 2 * self.simulation.model.nv)) if starts is None else starts.copy()
         for _ in range(iterations):
             r, jt, jx = self.linearise(values, starts, free)

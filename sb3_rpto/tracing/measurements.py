@@ -4,6 +4,8 @@ import csv
 import glob
 import gzip
 import os
+import zipfile
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -51,6 +53,13 @@ class Measurements:
         """Actuator names, in the order of the columns of ``ctrl``."""
         return self.columns.ctrl
 
+    def __repr__(self) -> str:
+        """A line instead of the arrays."""
+        samples = sum(map(len, self.episodes))
+        seconds = sum(float(np.ptp(e.time)) for e in self.episodes)
+        names = f"joints {', '.join(self.joints)}; actuators {', '.join(self.actuators) or 'none'}"
+        return f"<Measurements: {len(self.episodes)} episodes, {samples} samples, {seconds:.4g} s; {names}>"
+
     @classmethod
     def from_csv(cls, paths: Paths) -> "Measurements":
         """Read CSV files, also gzipped (``.csv.gz``); a file without an ``episode`` column is one episode.
@@ -81,8 +90,11 @@ class Measurements:
         """Read npz archives with one array of shape (T,) for each column, as :meth:`from_csv` does."""
         tables = {}
         for path in _expand(paths):
-            with np.load(path, allow_pickle=False) as archive:
-                tables[path] = {name: archive[name] for name in archive.files}
+            try:
+                with np.load(path, allow_pickle=False) as archive:
+                    tables[path] = {name: archive[name] for name in archive.files}
+            except (zipfile.BadZipFile, EOFError, AttributeError) as error:  # the last: a single array
+                raise ValueError(f"{path}: no whole npz archive of named arrays ({error}); write it again") from error
         return cls.from_tables(tables)
 
     @classmethod
@@ -247,8 +259,11 @@ class Measurements:
 def _read_csv(path: str) -> dict[str, np.ndarray]:
     """Columns as strings: numpy turns them into the nearest floats, which some faster parsers do not."""
     opener = gzip.open if path.endswith(".gz") else open
-    with opener(path, "rt", newline="", encoding="utf-8-sig") as stream:
-        rows = [row for row in csv.reader(stream) if row]
+    try:
+        with opener(path, "rt", newline="", encoding="utf-8-sig") as stream:
+            rows = [row for row in csv.reader(stream) if row]
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise ValueError(f"{path}: no whole gzip file ({error}); write it again") from error
     if not rows:
         raise ValueError(f"{path}: the file is empty; give a header and one row a sample")
     header = rows.pop(0)

@@ -11,9 +11,11 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 from scipy.signal import savgol_filter
 
+from sb3_rpto.effects.simulation import FILTERS
 from sb3_rpto.tracing.checks import WINDOW, Finding, smoothed_velocity
 from sb3_rpto.tracing.columns import columns_of, joint_of
 from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.windows import discretised, stiff
 
 ALL = "all episodes"
 SLOW = 0.02
@@ -25,6 +27,7 @@ SMOOTHING = 0.06
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # the first of the scalar ones
 _LIMIT = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)  # the first of limits and contacts
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_KNOWN_DYNAMICS = (int(mujoco.mjtDyn.mjDYN_NONE), *FILTERS)
 _MAX_LAG = 25
 _FEWEST = 30
 _BUDGET = 40_000  # samples in all: about two seconds for a small robot
@@ -45,10 +48,11 @@ def check_against(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     :param model: of the machine
     :param data: recordings, their names as in the model; the order of the columns does not matter
     :return: what was found, nothing is repaired
-    :raises ValueError: joints or actuators that are not in both, or a wrong number of coordinates; the message names
-        the nearest names
+    :raises ValueError: joints or actuators that are not in both, or a wrong number of coordinates (the message names
+        the nearest names), actuators that integrate their commands
     """
     check_names(model, data)
+    _check_actuators(model)
     return _sampling(model, data) + _responses(model, data)
 
 
@@ -87,6 +91,20 @@ def check_names(model: mujoco.MjModel, data: Measurements) -> None:
                 )
 
 
+def _check_actuators(model: mujoco.MjModel) -> None:
+    """Refuse actuators whose own state at a window's start is in no column."""
+    for i, count in enumerate(model.actuator_ctrlnum):
+        name, dynamics = model.actuator(i).name or f"actuator{i}", int(model.actuator_dyntype[i])
+        if count != 1:
+            raise ValueError(f"actuator {name!r} takes {count} commands; traced are those of one, such as <position>")
+        if dynamics not in _KNOWN_DYNAMICS:
+            kind = mujoco.mjtDyn(dynamics).name.removeprefix("mjDYN_").lower()
+            raise ValueError(
+                f"actuator {name!r} has a state of its own (dyntype {kind}) that no column holds and no commands tell; "
+                "model it without, and give what it puts out as its command"
+            )
+
+
 def _sampling(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     if not data.episodes:
         return []
@@ -99,6 +117,9 @@ def _sampling(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
             f"one of {step / max(1, np.ceil(step / timestep)):.6g} s would be"
         )
         found.append(Finding("sampling", f"{ALL}, time", message))
+    if not data.exact and stiff(discretised(model, data, fine=False)):
+        message = "too stiff for the Runge-Kutta method at this timestep: integrated implicitly, less finely"
+        found.append(Finding("stiff model", "the model", message))
     if step > 1.01 * SLOW and not data.exact:
         message = f"the median step is {step:.4g} s; effects faster than that, such as a short delay, leave no trace"
         found.append(Finding("slow sampling", f"{ALL}, time", message))

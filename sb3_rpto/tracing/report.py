@@ -13,6 +13,7 @@ import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.carry import carried_by, save_corrected
+from sb3_rpto.effects.units import unit_at
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import Adequacy
 from sb3_rpto.tracing.checks import Finding
@@ -98,6 +99,7 @@ class Report:
     :param findings: all that was found and repaired in the data
     :param noise: of each position column, rad or m
     :param runs: names of the train, select and test runs
+    :param judged_apart: whether adequacy is that on select runs; else on the training runs, which were fitted
     :param threshold: t*
     :param horizon: length of the windows in s
     """
@@ -119,6 +121,7 @@ class Report:
     findings: list[Finding]
     noise: dict[str, float]
     runs: dict[str, list[str]]
+    judged_apart: bool
     threshold: float
     horizon: float
     seed: int
@@ -148,7 +151,8 @@ class Report:
         if self.effects:
             claim = "it lacks" if self.verdict == "explained" else "closer to the data with, but not explained by"
             lines += ["", claim, *wording.aligned(self._values(self.effects)), *self._evidence()]
-        lines += ["", "adequacy R: error over that of noise alone, on select windows; 1 where nothing is missing"]
+        apart = "on select windows" if self.judged_apart else "on fitted windows, as too few runs are set apart"
+        lines += ["", f"adequacy R: error over that of noise alone, {apart}; 1 where nothing is missing"]
         lines += [f"  before {self.adequacy_before}, after {self.adequacy_after}"]
         tested = "test runs" if self.runs["test"] else "the fitted runs, as there are no test runs"
         lines += ["", f"error on {tested}: RMSE [95 % interval, of whole runs their range]"]
@@ -169,7 +173,7 @@ class Report:
             label = t.label
             for p, value, (low, high) in zip(t.effect.parameters, t.effect.values, t.interval.T):
                 name = "" if isinstance(t.effect, Declared) else p.name
-                unit = wording.unit_at(t.effect, p.unit, self.simulation.model)
+                unit = unit_at(t.effect, p.unit, self.simulation.model)
                 rows.append([label, name, wording.number(value), wording.interval(low, high), unit])
                 label = ""
         return rows
@@ -242,7 +246,7 @@ class Report:
             return {
                 "label": t.label,
                 "parameters": {
-                    p.name: {"value": v, "low": low, "high": high, "unit": wording.unit_at(t.effect, p.unit, model)}
+                    p.name: {"value": v, "low": low, "high": high, "unit": unit_at(t.effect, p.unit, model)}
                     for p, v, (low, high) in zip(t.effect.parameters, t.effect.values, t.interval.T)
                 },
                 "equation": t.effect.equation,
@@ -275,6 +279,7 @@ class Report:
             "findings": [vars(f) for f in self.findings],
             "noise": self.noise,
             "runs": self.runs,
+            "judged_apart": self.judged_apart,
             "threshold": self.threshold,
             "horizon": self.horizon,
             "seed": self.seed,

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.signal import butter, filtfilt
 
 from sb3_rpto.effects import Effect, Scales, Simulation
-from sb3_rpto.effects.simulation import filter_commands, names_of, prepare
-from sb3_rpto.effects.world import BatchWorld
+from sb3_rpto.effects.simulation import Switch, filter_commands, names_of, prepare, settled
+from sb3_rpto.effects.world import BatchWorld, LiveWorld
 from sb3_rpto.tracing.checks import MIN_ROWS
 from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.measurements import Measurements
@@ -82,7 +82,9 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     qacc = np.gradient(qvel, h, axis=0)
     row = np.clip(np.searchsorted(e.time, time + 1e-9, side="right") - 1, 0, len(e) - 1)
     commands = np.zeros((1, len(time), nominal.nu))
-    commands[0][:, command_order(nominal, data)] = e.ctrl[row] * e.enabled[row]
+    enabled = np.ones_like(commands)
+    order = command_order(nominal, data)
+    commands[0][:, order], enabled[0][:, order] = e.ctrl[row] * e.enabled[row], e.enabled[row]
     active = [
         (effect, values[None, s])
         for effect, s in zip(simulation.effects, simulation.slices)
@@ -92,8 +94,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     # The motion at a sample answers to the commands held before and after it alike.
     around = 0.5 * (commands + np.concatenate([commands[:1], commands[:-1]]))
     world = BatchWorld(nominal, 1, 1)
-    for name, value in e.params.items():
-        simulation._setting(name).write(world, np.array([[value]]))
+    simulation.set(world, {name: np.array([value]) for name, value in e.params.items()})
     prepare(world, active)
     model = world.batch.get_model(0)
     friction = model.dof_frictionloss.copy()
@@ -101,14 +102,22 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     model.dof_frictionloss[:] = 0
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
     mj = mujoco.MjData(model)
+    mj.act[:] = settled(model, around[:1])[0]
+    # Actuators with a memory are led along the motion by the simulator's own steps.
+    substeps = max(1, round(h / model.opt.timestep)) if model.na or model.nhistory else 0
+    switch = Switch(LiveWorld(model, mj), None if enabled.all() else enabled)
     needed, load = np.zeros_like(qvel), np.zeros_like(qvel)
     extra = np.zeros_like(qvel)
     acting = [(effect, x) for effect, x in active if effect.overrides("act")]
     for t in range(len(time)):
+        switch(t)
         mj.qpos[:], mj.qvel[:], mj.ctrl[:] = qpos[t], qvel[t], around[t]
-        mujoco.mj_forward(model, mj)
+        if substeps:
+            mujoco.mj_step(model, mj, substeps)
+        else:
+            mujoco.mj_forward(model, mj)
         load[t] = mj.qfrc_actuator
-        mj.qacc[:] = qacc[t]
+        mj.qpos[:], mj.qvel[:], mj.qacc[:] = qpos[t], qvel[t], qacc[t]
         mujoco.mj_inverse(model, mj)
         needed[t] = mj.qfrc_inverse
         level = friction.copy()

@@ -11,19 +11,22 @@ import numpy as np
 
 from sb3_rpto.effects import Drive
 from sb3_rpto.effects.names import SCALAR_JOINTS, object_id, object_names
-from sb3_rpto.effects.simulation import names_of
+from sb3_rpto.effects.simulation import FILTERS, names_of
 from sb3_rpto.tracing import checks
 from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.measurements import Measurements
 
-#: Seconds of commands kept from before a window, for delays and filters.
-MEMORY = 0.25
+#: Seconds of commands kept from before a window, for effects that delay and filter; of the model's own filters so many
+#: time constants.
+MEMORY, CONSTANTS = 0.25, 5
 #: Exact data (from a simulator) count as noisy by this share of a position's standard deviation.
 EXACT = 1e-4
 #: Least length of a block of windows in s; blocks count as independent.
 BLOCK = 1.0
 #: Longest integration step in s for measured data.
 LONGEST = 0.002
+#: The Runge-Kutta method is stable up to 2.8 for the product of a step and the model's fastest rate; poses differ.
+STIFF = 2.0
 #: Half the time, in s, over which the state at a window's start is smoothed, and the fewest samples on each side.
 HALF_WIDTH, HALF_COUNT = 0.025, 4
 
@@ -45,6 +48,7 @@ class Windows:
     :param block: number of the block of neighbouring windows, (W,); blocks are taken as independent
     :param episode: index of the episode, (W,)
     :param time: of the start in the episode, in s, (W,)
+    :param exact: whether the samples come from a simulator
     """
 
     qpos: np.ndarray
@@ -60,13 +64,14 @@ class Windows:
     block: np.ndarray
     episode: np.ndarray
     time: np.ndarray
+    exact: bool
 
     def __len__(self) -> int:
         return len(self.qpos)
 
     def take(self, index: np.ndarray) -> Windows:
         """The windows at ``index``."""
-        shared = ("drive", "sigma", "columns")
+        shared = ("drive", "sigma", "columns", "exact")
         own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in shared}
         return replace(self, drive=self.drive.take(index), **own)
 
@@ -149,14 +154,63 @@ def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco
 
     A simulator's data are met by its own integrator and time step. The world knows no steps: measured data take steps
     of at most 2 ms, with the Runge-Kutta method of fourth order where it is to be ``fine``. A semi-implicit step of
-    1 ms errs by about a milliradian in half a second.
+    1 ms errs by about a milliradian in half a second. A model that is too stiff for that method keeps its own implicit
+    one, or takes MuJoCo's fast one.
     """
     copy = model.__copy__()
     if not data.exact:
         copy.opt.timestep = model.opt.timestep / math.ceil(model.opt.timestep / LONGEST - 1e-9)
-        if fine:
+        if fine and stiff(copy):
+            copy.opt.integrator = int(_IMPLICIT.get(model.opt.integrator, _FAST))
+        elif fine:
             copy.opt.integrator = int(mujoco.mjtIntegrator.mjINT_RK4)
+            # The exact filter takes the mean rate of the four stages for that at the step's start, and errs by it.
+            exact = copy.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+            copy.actuator_dyntype[exact] = int(mujoco.mjtDyn.mjDYN_FILTER)
     return copy
+
+
+_FAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+_IMPLICIT = {int(i): i for i in (_FAST, mujoco.mjtIntegrator.mjINT_IMPLICIT)}
+
+
+def stiff(model: mujoco.MjModel) -> bool:
+    """Whether the Runge-Kutta method would be unstable at the model's time step, near its reference pose.
+
+    Looked at are the eigenvalues of the motion without contacts, limits and dry friction, linearised by differences.
+    """
+    free = model.__copy__()
+    free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    data, nv, eps = mujoco.MjData(free), model.nv, 1e-6
+
+    def acceleration(dq: np.ndarray, v: np.ndarray) -> np.ndarray:
+        data.qpos[:] = free.qpos0
+        mujoco.mj_integratePos(free, data.qpos, dq, 1.0)
+        data.qvel[:] = v
+        mujoco.mj_forward(free, data)
+        return data.qacc.copy()
+
+    none, units = np.zeros(nv), eps * np.eye(nv)
+    rates = np.zeros((2 * nv, 2 * nv))
+    rates[:nv, nv:] = np.eye(nv)
+    for i, unit in enumerate(units):
+        rates[nv:, i] = (acceleration(unit, none) - acceleration(-unit, none)) / (2 * eps)
+        rates[nv:, nv + i] = (acceleration(none, unit) - acceleration(none, -unit)) / (2 * eps)
+    return bool(np.abs(np.linalg.eigvals(rates)).max(initial=0.0) * model.opt.timestep > STIFF)
+
+
+def memory(model: mujoco.MjModel) -> float:
+    """Seconds of past commands that the model's own actuators remember, by filters and delays."""
+    filters = np.isin(model.actuator_dyntype, FILTERS)
+    own = CONSTANTS * model.actuator_dynprm[filters, 0]
+    return max(float(own.max(initial=0.0)), float(model.actuator_delay.max(initial=0.0)))
+
+
+def first_sample(model: mujoco.MjModel, episode: Episode, exact: bool) -> int:
+    """Where the first window may begin: what its actuators remember is recorded, and smoothing has both its sides."""
+    known = int(np.searchsorted(episode.time, episode.time[0] + memory(model) - 1e-9))
+    step = float(np.median(np.diff(episode.time)))
+    return min(max(known, 0 if exact else max(HALF_COUNT, round(HALF_WIDTH / step))), len(episode) - 1)
 
 
 def cut(
@@ -179,8 +233,7 @@ def cut(
     """
     starts = []
     for number, e in enumerate(data.episodes):
-        step = float(np.median(np.diff(e.time)))
-        begin = 0 if data.exact else min(max(HALF_COUNT, round(HALF_WIDTH / step)), len(e) - 1)
+        begin = first_sample(model, e, data.exact)
         while True:
             end = int(np.searchsorted(e.time, e.time[begin] + horizon + 1e-9, side="right"))
             if e.time[-1] < e.time[begin] + horizon - 1e-9 or end - begin < 3:
@@ -207,7 +260,7 @@ def _build(
     starts: Sequence[tuple[int, int, int]],
 ) -> Windows:
     h = float(model.opt.timestep)
-    steps, before = math.ceil(horizon / h - 1e-6), math.ceil(MEMORY / h)
+    steps, before = math.ceil(horizon / h - 1e-6), math.ceil(max(MEMORY, memory(model)) / h)
     count, samples = len(starts), max(end - begin for _, begin, end in starts) - 1
     observed = [i for i, name in enumerate(data.columns.qpos) if name not in data.unobserved]
     addresses = names_of(model, data.columns.qpos)
@@ -258,6 +311,7 @@ def _build(
         block,
         np.array([number for number, _, _ in starts]),
         np.array([data.episodes[number].time[begin] for number, begin, _ in starts]),
+        data.exact,
     )
 
 
@@ -269,6 +323,8 @@ def held(time: np.ndarray, ctrl: np.ndarray, edges: np.ndarray) -> np.ndarray:
     :param edges: of the steps in s, (K + 1,)
     :return: (K, nu)
     """
+    if not ctrl.shape[1]:
+        return np.empty((len(edges) - 1, 0))
     ends = min(time[0], edges[0]) - 1.0, max(time[-1], edges[-1]) + 1.0
     knots = np.concatenate([[ends[0]], time, [ends[1]]])
     levels = np.concatenate([ctrl[:1], ctrl])

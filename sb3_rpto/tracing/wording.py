@@ -8,14 +8,14 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects import Declared, Effect
-from sb3_rpto.effects.actuation import drivers
+from sb3_rpto.effects import Effect
 from sb3_rpto.effects.names import SCALAR_JOINTS, object_id, object_names
+from sb3_rpto.effects.units import joint_of
 
 #: For each verdict what it means, and what it does not mean.
 VERDICTS = {
     "complete": (
-        "Nothing is missing: with its declared parameters fitted, the model predicts unseen windows as well as the "
+        "Nothing is missing: with its declared parameters fitted, the model predicts the data as well as the "
         "measurement noise allows.",
         "This holds for motion like the recorded one. Effects that these data cannot show may still be there.",
     ),
@@ -35,36 +35,11 @@ VERDICTS = {
 }
 
 
-def unit_at(effect: Effect, unit: str, model: mujoco.MjModel) -> str:
-    """The unit of a parameter where an effect sits: units are stated for hinges, a slide has m for rad and N for N·m.
-
-    :param unit: as in :class:`~sb3_rpto.effects.effect.Parameter`
-    """
-    if isinstance(effect, Declared):
-        joint = effect.index if effect.owner == "joint" else -1
-    elif effect.place in ("joint", "sensor", "actuator"):
-        joint = _joint(effect, model)
-    else:
-        joint = -1
-    if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_SLIDE:
-        return unit
-    return unit.replace("kg·m²", "kg").replace("N·m", "N").replace("(N)", "N").replace("rad", "m")
-
-
-def _joint(effect: Effect, model: mujoco.MjModel) -> int:
-    """Id of the joint that an effect of a joint, a sensor or an actuator acts on; -1: none."""
-    if effect.place in ("joint", "sensor"):
-        return object_id(model, "joint", effect.on)
-    actuator = object_id(model, "actuator", effect.on)
-    joints = (j for j in range(model.njnt) if actuator in drivers(model, j))
-    return next(joints, -1)
-
-
 def dofs_of(effect: Effect, model: mujoco.MjModel) -> list[int]:
     """Degrees of freedom of hinges and slides that an effect acts on: of its joint, of its body's chain, or all."""
     scalar = scalar_dofs(model)
     if effect.place in ("joint", "sensor", "actuator"):
-        joint = _joint(effect, model)
+        joint = joint_of(effect, model)
         return [d for d in scalar if d == (model.jnt_dofadr[joint] if joint >= 0 else d)]
     if effect.place not in ("body", "geom"):
         return scalar

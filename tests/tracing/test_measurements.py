@@ -48,6 +48,10 @@ def write_csv(path, table):
     path.write_text("\n".join([",".join(table), *(",".join(map(str, row)) for row in rows)]))
 
 
+def test_it_prints_in_a_line():
+    assert repr(several(2)) == "<Measurements: 2 episodes, 400 samples, 3.98 s; joints hinge; actuators motor>"
+
+
 def test_clean_data_have_no_findings():
     data = Measurements.from_tables({"a": swing()})
     assert data.findings == []

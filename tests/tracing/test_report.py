@@ -12,6 +12,7 @@ from sb3_rpto.effects import Drive, Simulation
 from sb3_rpto.effects.carry import load_corrected
 from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.friction import CoulombFriction
+from sb3_rpto.effects.units import unit_at
 from sb3_rpto.tracing import Report, wording
 from sb3_rpto.tracing.report import Traced, write_atomically
 
@@ -135,7 +136,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path)
 )
 def test_units_are_those_of_the_joint(effect, unit: str) -> None:
     model = mujoco.MjModel.from_xml_string(SLIDE)
-    assert wording.unit_at(effect, effect.parameters[0].unit, model) == unit
+    assert unit_at(effect, effect.parameters[0].unit, model) == unit
 
 
 def test_units_of_slides_replace_angles() -> None:
@@ -144,9 +145,9 @@ def test_units_of_slides_replace_angles() -> None:
 
     model = mujoco.MjModel.from_xml_string(SLIDE)
     (damping,) = declare(model, ["rail.damping"])
-    assert wording.unit_at(damping, damping.parameters[0].unit, model) == "N·s/m"
-    assert [wording.unit_at(Spring("rail"), p.unit, model) for p in Spring.parameters] == ["N/m", "m"]
-    assert [wording.unit_at(DCMotor("push"), p.unit, model) for p in DCMotor.parameters] == ["1/N", "s/m"]
+    assert unit_at(damping, damping.parameters[0].unit, model) == "N·s/m"
+    assert [unit_at(Spring("rail"), p.unit, model) for p in Spring.parameters] == ["N/m", "m"]
+    assert [unit_at(DCMotor("push"), p.unit, model) for p in DCMotor.parameters] == ["1/N", "s/m"]
 
 
 def test_joints_that_an_effect_acts_on() -> None:
