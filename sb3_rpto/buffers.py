@@ -129,7 +129,7 @@ class DualReplayBuffer(ReplayBuffer):
     ) -> None:
         """Add one target step of any number of environments; arguments as in SB3."""
         timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
-        self.append("target", obs, next_obs, action, reward, done, timeouts)
+        self.append("target", obs, next_obs, action, reward, done, timeouts, infos)
 
     def resize_source(self, capacity: int) -> None:
         """Give the source side another capacity; the newest transitions that fit are kept.
@@ -152,6 +152,7 @@ class DualReplayBuffer(ReplayBuffer):
         rewards: np.ndarray,
         dones: np.ndarray,
         timeouts: np.ndarray | None = None,
+        infos: Any = None,
     ) -> None:
         """Add ``n`` transitions to one world.
 
@@ -162,6 +163,7 @@ class DualReplayBuffer(ReplayBuffer):
         :param rewards: (n,)
         :param dones: (n,), whether the episode ended
         :param timeouts: (n,), whether it ended by a time limit; None: nowhere
+        :param infos: SB3's list of n dicts, for a replay buffer class of the user's; None: the time limits alone
         """
         side = self.side(world)
         n = len(rewards)
@@ -169,7 +171,7 @@ class DualReplayBuffer(ReplayBuffer):
         actions = actions.reshape(n, -1)
         if type(side).add is not ReplayBuffer.add or n > side.buffer_size:  # a class of the user's sees every row
             for i in range(n):
-                info = [{"TimeLimit.truncated": bool(timeouts[i])}]
+                info = [{**(infos[i] if infos else {}), "TimeLimit.truncated": bool(timeouts[i])}]
                 row = slice(i, i + 1)
                 side.add(observations[row], next_observations[row], actions[row], rewards[row], dones[row], info)
             return
@@ -201,10 +203,14 @@ def chronological(side: ReplayBuffer) -> dict[str, np.ndarray]:
     order = np.arange(side.size())
     if side.full:
         order = (order + side.pos) % side.buffer_size
-    flat = {
-        name: getattr(side, name)[order].reshape(len(order) * side.n_envs, *getattr(side, name).shape[2:])
-        for name in _ARRAYS
-    }
+    rows = {name: getattr(side, name)[order] for name in _ARRAYS if hasattr(side, name)}
+    kept = np.ones((len(order), side.n_envs), dtype=bool)
+    if side.optimize_memory_usage:
+        # One array holds both: lost are the oldest observation, once overwritten, and what ended an episode.
+        rows["next_observations"] = side.observations[(order + 1) % side.buffer_size]
+        kept = rows["dones"] == 0
+        kept[:1] &= not side.full
+    flat = {name: values[kept] for name, values in rows.items()}
     terminations = flat.pop("dones") * (1 - flat.pop("timeouts"))
     return {**flat, "terminations": terminations}
 

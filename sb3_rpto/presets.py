@@ -21,8 +21,9 @@ def resolve_preset(preset: str, backend: str, env_id: str | None, passed: Collec
     """What a preset sets for an algorithm's constructor.
 
     A preset file has sections: ``any`` (every environment), a dynamics backend's name, and environment names without
-    version. The later of these win; what the user passed wins over all. An environment that the file does not name
-    gets the sections ``any`` and the backend's, which is the documented default.
+    version, which may hold a section for a backend in their turn. The later of these win; what the user passed wins
+    over all. An environment that the file does not name gets the sections ``any`` and the backend's, which is the
+    documented default.
 
     :param preset: name of a shipped preset
     :param backend: "real" (RPO), "ensemble" or "physical"
@@ -34,8 +35,10 @@ def resolve_preset(preset: str, backend: str, env_id: str | None, passed: Collec
         raise ValueError(f"preset={preset!r} does not exist; choose one of {preset_names()}")
     sections = yaml.safe_load((_FOLDER / f"{preset}.yml").read_text(encoding="utf-8"))
     values: dict[str, Any] = {}
-    for section in ("any", backend, _bare_name(env_id)):
-        for name, value in sections.get(section, {}).items():
+    of_task = sections.get(_bare_name(env_id), {})
+    everywhere = {name: value for name, value in of_task.items() if name not in sections}
+    for section in (sections["any"], sections.get(backend, {}), everywhere, of_task.get(backend, {})):
+        for name, value in section.items():
             if isinstance(value, dict):
                 value = {**values.get(name, {}), **value}
             values[name] = value

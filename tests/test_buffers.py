@@ -165,3 +165,39 @@ def test_load_transitions_refuses_what_it_cannot_use(tmp_path):
     bad.append("source", **data)
     with pytest.raises(ValueError, match="rewards"):
         load_transitions(bad)
+
+
+class Costly(ReplayBuffer):
+    """Keeps what an environment says a step cost."""
+
+    costs: list
+
+    def add(self, obs, next_obs, action, reward, done, infos):
+        self.costs = [*getattr(self, "costs", []), infos[0].get("cost")]
+        super().add(obs, next_obs, action, reward, done, infos)
+
+
+def test_a_buffer_class_of_the_users_sees_the_infos():
+    space = spaces.Box(-1, 1, (2,))
+    buffer = DualReplayBuffer(10, space, space, side_class=Costly)
+    rows = np.zeros((2, 2), dtype=np.float32)
+    buffer.add(rows, rows, rows, np.zeros(2), np.zeros(2), [{"cost": 3}, {"cost": 4, "TimeLimit.truncated": True}])
+    assert buffer.target.costs == [3, 4]
+    assert buffer.target.timeouts[1, 0] == 1
+
+
+@pytest.mark.parametrize("steps", [6, 25])
+def test_transitions_of_a_buffer_that_saves_memory_are_those_that_it_still_knows(steps):
+    space = spaces.Box(-np.inf, np.inf, (1,))
+    whole, saving = (
+        ReplayBuffer(10, space, space, handle_timeout_termination=False, optimize_memory_usage=flag)
+        for flag in (False, True)
+    )
+    for k in range(steps):
+        at = np.array([[float(k)]], dtype=np.float32)
+        for buffer in (whole, saving):
+            buffer.add(at, at + 1, at, np.array([float(k)]), np.array([k % 4 == 3]), [{}])
+    expected, found = load_transitions(whole), load_transitions(saving)
+    known = (expected["observations"][:, 0] % 4 != 3) & (np.arange(len(expected["rewards"])) >= (steps > 10))
+    for name in expected:
+        np.testing.assert_array_equal(found[name], expected[name][known], err_msg=name)

@@ -35,3 +35,14 @@ def test_what_the_user_passed_wins():
 def test_an_unknown_preset_names_the_others():
     with pytest.raises(ValueError, match="paper"):
         resolve_preset("papre", "ensemble", None, ())
+
+
+@pytest.mark.parametrize("preset", preset_names())
+@pytest.mark.parametrize("backend", ["real", "ensemble", "physical", "mujoco", "residual"])
+@pytest.mark.parametrize("task", ["Ant", "HalfCheetah", "Hopper", "Walker2d", "Swimmer"])
+def test_the_networks_numbers_of_a_task_are_for_networks_alone(preset, backend, task):
+    values, everywhere = (resolve_preset(preset, backend, name, ()) for name in (f"{task}-v5", None))
+    assert not {"any", "real", "ensemble", "physical", "mujoco", "residual"} & values.keys()
+    if backend != "ensemble":
+        assert values.get("dynamics_kwargs") == everywhere.get("dynamics_kwargs")
+        assert values.get("model_train_freq") == everywhere.get("model_train_freq")

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from numbers import Integral
 from typing import Any
 
+import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto.algorithms.bookkeeping import TwoWorlds
 from sb3_rpto.dynamics.factory import BACKENDS, is_mujoco
 from sb3_rpto.dynamics.weights import WEIGHTINGS
+from sb3_rpto.effects import LIBRARY
+from sb3_rpto.effects.names import near
 
 #: Arguments that only an algorithm with trainable dynamics has a use for.
 DYNAMICS_ARGUMENTS = frozenset(
@@ -102,12 +107,19 @@ def check_values(
             raise ValueError(f"{name} must be a positive integer, got {value!r}")
 
 
-def check_something_to_fit(config: dict[str, Any], close_loop: bool) -> None:
-    """Refuse a physical model without parameters, and a closed loop without a MuJoCo simulator.
+def check_something_to_fit(config: dict[str, Any], close_loop: bool | Sequence[str]) -> None:
+    """Refuse a physical model without parameters, and a closed loop without a MuJoCo simulator or known effects.
 
     :param config: of the dynamics
+    :param close_loop: whether, or the kinds of effects to look for
     :raises ValueError: with the remedy
+    :raises TypeError: for a single kind
     """
+    if isinstance(close_loop, str):
+        raise TypeError(f"close_loop must be True or a list of kinds, not a string; write [{close_loop!r}]")
+    for kind in [] if isinstance(close_loop, bool) else close_loop:
+        if kind not in LIBRARY:
+            raise ValueError(f"close_loop: no effect {kind!r} is registered; {near(kind, LIBRARY)}")
     mujoco = config["backend"] == "physical" and is_mujoco(config)
     if close_loop and not mujoco:
         raise ValueError(
@@ -120,6 +132,27 @@ def check_something_to_fit(config: dict[str, Any], close_loop: bool) -> None:
         )
 
 
+def check_rules(kwargs: dict[str, Any], observation_space: spaces.Space, action_space: spaces.Space) -> None:
+    """Refuse rules of the user's that answer in another form than the dynamics read.
+
+    :param kwargs: of the dynamics
+    :param observation_space: both worlds'
+    :param action_space: both worlds'
+    :raises ValueError: naming the rule and what it gave
+    """
+    seen, actions = (th.zeros(2, *space.shape) for space in (observation_space, action_space) if space.shape)
+    for name in ("reward_fn", "termination_fn"):
+        if kwargs.get(name) is None:
+            continue
+        answer = kwargs[name](seen, actions, seen)
+        if not isinstance(answer, th.Tensor) or answer.shape != (2,):
+            got = f"a tensor of shape {tuple(answer.shape)}" if isinstance(answer, th.Tensor) else type(answer).__name__
+            raise ValueError(
+                f"dynamics_kwargs[{name!r}] must answer n observations, actions and next observations by a tensor of "
+                f"shape (n,); of two it made {got}"
+            )
+
+
 def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | None) -> None:
     """Refuse to learn without both worlds or with a budget that makes no sense; arguments as those of ``learn()``.
 
@@ -127,6 +160,8 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
     """
     if model.env is None:
         raise ValueError("learn() needs the source environment: pass env= to load(), or call set_env()")
+    if model.env.env_is_wrapped(Monitor)[0] and not model.env.get_attr("allow_early_resets", indices=[0])[0]:
+        raise ValueError("env is in a Monitor(allow_early_resets=False), but is reset between phases; leave it True")
     if model.target_env is None and not model._offline:
         raise ValueError(
             "learn() needs the target: pass target_env= (an environment to interact with) or target_data= "
@@ -141,6 +176,8 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
         )
     if source_timesteps is not None and (not _is_integer(source_timesteps) or source_timesteps < 0):
         raise ValueError(f"source_timesteps must be an integer and not negative, got {source_timesteps!r}")
+    if model._offline and not model._traces_log and model.replay_buffer.target.size() == 0:
+        raise ValueError("D_target is empty: a checkpoint does not hold the target_data; call load_replay_buffer()")
     needs_rewards = model._offline and model.weighting is not None and not model._traces_log
     if needs_rewards and not model.replay_buffer.target.rewards.any():
         raise ValueError("target_data holds no rewards, which RTO's weight needs; pass weighting=None")

@@ -42,6 +42,23 @@ RECENT_EPISODES = 5
 STEP = ("buffer_actions", "new_obs", "rewards", "dones", "infos")
 
 
+class RuleOfEnvironment:
+    """Stands in a checkpoint for a rule that belongs to an environment which does not pickle.
+
+    :param name: of the rule
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __call__(self, *args: Any) -> Any:
+        """Say what is missing.
+
+        :raises RuntimeError: always
+        """
+        raise RuntimeError(f"{self.name} belongs to an environment; pass env= and target_env= to load()")
+
+
 class TwoWorlds(PolicySnapshots):
     """The two environments, and SB3's accounts of a run: the source is SB3's ``env``, all accounts are the target's.
 
@@ -67,6 +84,8 @@ class TwoWorlds(PolicySnapshots):
     #: the observation of SB3's reset of the source, where its first episode begins
     _source_first_obs: np.ndarray | None
     _null_check: NullShiftCheck | None
+    #: whether the model has the target's rules, after its first fit
+    _has_target_rules: bool
     #: the run's callbacks while it lasts: they know the step that SB3 has taken and not yet stored
     _callback: BaseCallback | None
     #: where a loaded checkpoint left the worlds, until ``learn()`` puts them back
@@ -77,6 +96,8 @@ class TwoWorlds(PolicySnapshots):
     def set_target_env(self, env: GymEnv | str) -> None:
         """Set the target; the next ``learn()`` starts a new episode there.
 
+        In the place of another target it begins with an empty D_target, and with no best policy.
+
         :param env: an environment, a VecEnv or an id
         :raises ValueError: when it is the source itself, has other spaces, or cannot be reset with a seed
         """
@@ -86,6 +107,16 @@ class TwoWorlds(PolicySnapshots):
         venv = self._wrap_env(env, self.verbose)
         if self.env is not None:
             check_pair(self.env, venv)
+        if self.target_env is not None:  # what the last target told holds for it alone
+            self.forget_best()
+            if self.replay_buffer.target.size() > 0:
+                warnings.warn(
+                    f"D_target loses {self.replay_buffer.target.size()} transitions of the target before; to go on in "
+                    "the same one, save, and load with target_env=",
+                    stacklevel=2,
+                )
+                self.replay_buffer.target.reset()
+        self._bind_rules(venv, of_target=True)
         self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
         self._offline = self._traces_log = False
         self._last_obs = None
@@ -106,11 +137,27 @@ class TwoWorlds(PolicySnapshots):
             if rule is not None and name not in self.dynamics_kwargs and config[name] is not None:
                 config[name] = rule  # what a checkpoint rebuilds the model from
                 setattr(self.dynamics, name, rule)
+        self._has_target_rules = True
+
+    def _bind_rules(self, env: VecEnv, of_target: bool) -> None:
+        """Give a loaded model the rules that its checkpoint could not hold, from the environment that they belong to.
+
+        :param env: the source or the target
+        :param of_target: which of them
+        """
+        config = self.dynamics_config or {}
+        rules = task_rules(env)
+        for name in ("reward_fn", "termination_fn"):
+            if isinstance(config.get(name), RuleOfEnvironment) and of_target == self._has_target_rules:
+                config[name] = getattr(rules, name) or config[name]
+                setattr(self.dynamics, name, config[name])
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Set the source environment, as in SB3; the target keeps sharing its normalisation."""
         last_obs = self._last_obs
         super().set_env(env, force_reset)
+        if self.env is not None:
+            self._bind_rules(self.env, of_target=False)
         self._last_obs = last_obs  # SB3 forgets the observation of what it takes to be the training env
         self._source_world = None
         if self.env is not None and self.target_env is not None:
@@ -144,10 +191,12 @@ class TwoWorlds(PolicySnapshots):
         """As SB3's, with the last observation and the action noise belonging to the target."""
         starts_episode = reset_num_timesteps or self._last_obs is None
         noise, self.action_noise = self.action_noise, None  # SB3 would size it by the source
-        total_timesteps, callback = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        self.action_noise = noise
+        try:
+            total_timesteps, callback = super()._setup_learn(
+                total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+            )
+        finally:
+            self.action_noise = noise
         if starts_episode:
             self._source_world, self._source_first_obs = None, self._last_obs  # SB3 has just reset the source
             if noise is not None and self._resume_state is None:
@@ -228,6 +277,8 @@ class TwoWorlds(PolicySnapshots):
     ) -> None:
         """Store a target transition as SB3 does, after a look at it."""
         check_finite("target", observation=np.asarray(new_obs), reward=reward)
+        for info in (info for info, done in zip(infos, dones) if done):  # new_obs is already that of the reset
+            check_finite("target", observation=np.asarray(info["terminal_observation"]))
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         assert self.target_env is not None
         find_ledger(self.target_env).unstored = False
@@ -252,8 +303,9 @@ class TwoWorlds(PolicySnapshots):
     def _judge_recent_episodes(self) -> None:
         """Keep the policy as the best if the newest target episodes earned more than any before."""
         assert self.ep_info_buffer is not None
-        recent = [info["r"] for info in list(self.ep_info_buffer)[-RECENT_EPISODES:]]
-        if len(recent) == RECENT_EPISODES:
+        count = min(RECENT_EPISODES, self._stats_window_size)
+        recent = [info["r"] for info in list(self.ep_info_buffer)[-count:]]
+        if len(recent) == count:
             self.keep_if_best(float(np.mean(recent)))
 
     def store_step(self, step: dict[str, Any]) -> None:
@@ -274,7 +326,7 @@ class TwoWorlds(PolicySnapshots):
         """What stands in for a target step when the target is a log: ``num_timesteps`` counts source steps."""
         self.num_timesteps += min(int(self.source_steps), self._steps_left())
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-        callback.update_locals(locals())
+        callback.update_locals({**locals(), "dones": np.zeros(1, dtype=bool), "infos": [{}]})  # no episode ends
         return callback.on_step()
 
 

@@ -10,12 +10,13 @@ import warnings
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
+import cloudpickle
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_rpto.algorithms.bookkeeping import STEP, TwoWorlds
+from sb3_rpto.algorithms.bookkeeping import STEP, RuleOfEnvironment, TwoWorlds
 from sb3_rpto.algorithms.worlds import find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.envs.state import restore_state, save_state
@@ -34,6 +35,7 @@ NOT_SAVED = (
     "_last_original_obs",
     "_source_first_obs",
     "_callback",
+    "_pretraining",
 )
 
 
@@ -53,11 +55,12 @@ class Resumable(TwoWorlds):
         if self.target_env is not None:  # a callback may save in the middle of a rollout
             self.target_spent = dict(find_ledger(self.target_env).spent)
         loaded = self._resume_state  # a loaded model that has not learned since stands where it was saved first
-        self._resume_state = loaded or capture(self)
+        self._resume_state = {**loaded, "warm": self._warm} if loaded else capture(self)
+        config, self.dynamics_config = self.dynamics_config, _picklable(self.dynamics_config)
         try:
             write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
         finally:
-            self._resume_state = loaded
+            self._resume_state, self.dynamics_config = loaded, config
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Save both replay buffers as one pickle; atomic for paths."""
@@ -106,6 +109,8 @@ class Resumable(TwoWorlds):
             saved_by = "RPO" if model.dynamics is None else "RTO or RPTO"
             raise ValueError(f"{path} was saved by {saved_by}, {cls.__name__} cannot continue it; load it there")
         model._warm = model._resume_state["warm"]
+        if model.env is not None:
+            model._bind_rules(model.env, of_target=False)
         if target_env is not None:
             model.set_target_env(target_env)
         return model
@@ -125,6 +130,19 @@ class Resumable(TwoWorlds):
             if hasattr(self.dynamics, "optimizer"):
                 state_dicts.append("dynamics.optimizer")
         return state_dicts, variables
+
+
+def _picklable(config: dict[str, Any] | None) -> dict[str, Any] | None:
+    """A config of the dynamics without rules whose environment does not pickle; these are read again after loading."""
+    if config is None:
+        return None
+    found = dict(config)
+    for name in {"reward_fn", "termination_fn"} & set(config):
+        try:
+            cloudpickle.dumps(config[name])
+        except Exception:  # whatever an environment's own pickling raises
+            found[name] = RuleOfEnvironment(name)
+    return found
 
 
 def capture(model: Resumable) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
+from sb3_rpto.envs.rules import env_id
 
 #: Arguments of RPTO that have no meaning where the model is fitted without weights and nothing is declared.
 UNUSED = frozenset({"preset", "dynamics", "declared", "close_loop", "weighting", "weight_floor"})
@@ -47,18 +48,17 @@ class MBPO(TransferAlgorithm):
     NUMBERS_OF_TASKS: ClassVar[dict[str, dict[str, Any]]] = {"HalfCheetah": {"gradient_steps": 40}}
 
     @classmethod
-    def published(cls, env_id: str | None) -> dict[str, Any]:
+    def published(cls, task_id: str | None) -> dict[str, Any]:
         """The paper's numbers for a task, as constructor arguments.
 
-        :param env_id: "HalfCheetah-v5" and "rpto/HalfCheetah-v0" are the same task; None: no task in particular
+        :param task_id: "HalfCheetah-v5" and "rpto/HalfCheetah-v0" are the same task; None: no task in particular
         """
-        task = re.sub(r"^.*[:/]|-v\d+$", "", env_id or "")
+        task = re.sub(r"^.*[:/]|-v\d+$", "", task_id or "")
         return {**cls.NUMBERS, **cls.NUMBERS_OF_TASKS.get(task, {})}
 
     def _apply_preset(self) -> None:
-        spec = None if self.env is None else self.env.get_attr("spec", indices=[0])[0]
         passed = self._passed - ({"source_steps"} if self.source_steps == "auto" else set())
-        for name, value in self.published(spec.id if spec else None).items():
+        for name, value in self.published(None if self.env is None else env_id(self.env)).items():
             if name not in passed:
                 setattr(self, name, value)
         self.weighting = None

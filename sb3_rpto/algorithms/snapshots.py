@@ -30,6 +30,11 @@ class PolicySnapshots(RelativeUpdate):
         self.take_snapshot("best")
         return True
 
+    def forget_best(self) -> None:
+        """Begin anew to look for the best policy."""
+        self.best_mean_reward = -np.inf
+        self.snapshots.pop("best", None)
+
     def rollback(self, to: Literal["best", "source"] = "best") -> None:
         """Go back to the best policy seen in the target, or to the one that came from the source.
 

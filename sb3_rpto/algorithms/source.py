@@ -117,7 +117,7 @@ class EpisodeSource(SourceWorld):
             check_finite("source", observation=raw_next, reward=rewards)
             timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
             scaled = model.policy.scale_action(actions)
-            model.replay_buffer.append("source", raw_obs, raw_next, scaled, rewards, dones, timeouts)
+            model.replay_buffer.append("source", raw_obs, raw_next, scaled, rewards, dones, timeouts, infos)
             for i in np.flatnonzero(dones):
                 self._episode_ended(int(i))
             for info in infos:

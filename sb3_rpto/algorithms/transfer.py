@@ -28,6 +28,7 @@ from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.weights import WeightingName
+from sb3_rpto.envs.rules import env_id
 from sb3_rpto.presets import resolve_preset
 from sb3_rpto.tracing import Measurements
 
@@ -201,6 +202,7 @@ class TransferAlgorithm(Resumable):
         self._source_world = None
         self._source_first_obs = None
         self._null_check = None
+        self._has_target_rules = False
         self._callback = None
         self._resume_state = None
 
@@ -211,7 +213,8 @@ class TransferAlgorithm(Resumable):
                 self.dynamics_config = dynamics_config(
                     self.dynamics_backend, self.env, self.dynamics_kwargs, self.declared
                 )
-                arguments.check_something_to_fit(self.dynamics_config, bool(self.close_loop))
+                arguments.check_something_to_fit(self.dynamics_config, self.close_loop)
+                arguments.check_rules(self.dynamics_kwargs, self.observation_space, self.action_space)
             self._setup_model()
             if target_env is not None:
                 self.set_target_env(target_env)
@@ -227,10 +230,9 @@ class TransferAlgorithm(Resumable):
     def _apply_preset(self) -> None:
         """Set what the user did not pass; of ``dynamics_kwargs``, which both may give, the entries passed win."""
         backend = self._preset_section()
-        spec = None if self.env is None else self.env.get_attr("spec", indices=[0])[0]
-        env_id = spec.id if spec else None
+        source_id = None if self.env is None else env_id(self.env)
         passed = self._passed - {"dynamics_kwargs"} - ({"source_steps"} if self.source_steps == "auto" else set())
-        for name, value in resolve_preset(self.preset, backend, env_id, passed).items():
+        for name, value in resolve_preset(self.preset, backend, source_id, passed).items():
             if name == "dynamics_kwargs":
                 value = {**value, **self.dynamics_kwargs}
             setattr(self, name, value)
@@ -309,7 +311,8 @@ class TransferAlgorithm(Resumable):
         sac = warm.load_sac(source_model, kwargs.get("device", "auto"))
         settings = {**warm.carried_arguments(sac), **kwargs}
         model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **settings)
-        warm.carry_over(sac, model)
+        # "auto" asks for a learned temperature, a number or "auto_0.5" for that one.
+        warm.carry_over(sac, model, temperature=kwargs.get("ent_coef", "auto") == "auto")
         if source_data is not None:
             warm.fill_source(model, source_data)
         return model

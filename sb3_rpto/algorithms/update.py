@@ -197,7 +197,7 @@ class RelativeUpdate(SAC):
     def critic_batches(self, count: int, batch_size: int) -> Iterator[ReplayBufferSamples]:
         """Batches of D_source with their share ``real_ratio`` of D_target; while pretraining of D_source alone."""
         real = not self._pretraining and self.replay_buffer.target.size() > 0
-        n_target = round(self.real_ratio * batch_size) if real else 0
+        n_target = min(round(self.real_ratio * batch_size), batch_size - 1) if real else 0
         drawn = self._draw("source", count, batch_size - n_target)
         return map(_concatenate, drawn, self._draw("target", count, n_target)) if n_target > 0 else drawn
 

@@ -56,9 +56,10 @@ def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
         ) from error
 
 
-def carry_over(sac: SAC, model: Resumable) -> None:
+def carry_over(sac: SAC, model: Resumable, temperature: bool = True) -> None:
     """Take over actor, critics, their targets, the temperature and the state of every optimiser.
 
+    :param temperature: whether to take over the temperature, too
     :raises ValueError: when the source model's spaces or networks are not the model's
     """
     for name in ("observation_space", "action_space"):
@@ -75,7 +76,10 @@ def carry_over(sac: SAC, model: Resumable) -> None:
         model.policy.load_state_dict(sac.policy.state_dict())
     except RuntimeError as error:
         raise ValueError(f"source_model's networks do not fit policy_kwargs={model.policy_kwargs}: {error}") from error
-    _carry_optimizers(sac, model)
+    for theirs, ours in ((sac.actor.optimizer, model.actor.optimizer), (sac.critic.optimizer, model.critic.optimizer)):
+        ours.load_state_dict(copy.deepcopy(theirs.state_dict()))
+    if temperature:
+        _carry_temperature(sac, model)
     model._warm = True
 
 
@@ -156,9 +160,13 @@ def begin_in_source(model: Resumable, source_timesteps: int, progress_bar: bool)
 
 
 def _collect_in_source(model: Resumable, n_steps: int) -> None:
-    """Act in the real source and fill D_source; nothing for ``n_steps`` <= 0."""
+    """Act in the source and fill D_source, in the real one for branches; nothing for ``n_steps`` <= 0."""
     assert model.env is not None  # learn() has checked
     if n_steps <= 0:
+        return
+    if model.dynamics is not None and model.dynamics.rollout == "episodes":  # phi may have moved: its own source
+        assert model._source_world is not None
+        model.source_timesteps += model._source_world.interact(model, n_steps)
         return
     model.source_timesteps += EpisodeSource(model.env).interact(model, n_steps)
     model.env.reset()
@@ -214,19 +222,18 @@ def _report(model: Resumable, source: EpisodeSource) -> None:
         model.save_replay_buffer(folder / "pretrain_replay_buffer.pkl")
 
 
-def _carry_optimizers(sac: SAC, model: Resumable) -> None:
-    """Take over the temperature and the state of every optimiser."""
-    pairs: list[tuple[Any, Any]] = [
-        (sac.actor.optimizer, model.actor.optimizer),
-        (sac.critic.optimizer, model.critic.optimizer),
-    ]
-    if sac.log_ent_coef is not None and model.log_ent_coef is not None:
+def _carry_temperature(sac: SAC, model: Resumable) -> None:
+    """Take over the temperature and, where both learn it, its optimiser's state."""
+    if model.log_ent_coef is None:
+        learned = None if sac.log_ent_coef is None else sac.log_ent_coef.detach().exp().reshape(())
+        model.ent_coef_tensor = (sac.ent_coef_tensor if learned is None else learned).clone().to(model.device)
+    elif sac.log_ent_coef is None:
+        model.log_ent_coef.data.fill_(float(sac.ent_coef_tensor.log()))
+    else:
+        assert model.ent_coef_optimizer is not None
+        assert sac.ent_coef_optimizer is not None
         model.log_ent_coef.data.copy_(sac.log_ent_coef.data)
-        pairs.append((sac.ent_coef_optimizer, model.ent_coef_optimizer))
-    elif model.log_ent_coef is None and sac.log_ent_coef is None:
-        model.ent_coef_tensor = sac.ent_coef_tensor.clone().to(model.device)
-    for theirs, ours in pairs:
-        ours.load_state_dict(copy.deepcopy(theirs.state_dict()))
+        model.ent_coef_optimizer.load_state_dict(copy.deepcopy(sac.ent_coef_optimizer.state_dict()))
 
 
 def _checked(arrays: dict[str, np.ndarray], model: Resumable, name: str) -> dict[str, np.ndarray]:
@@ -269,5 +276,12 @@ def _rewards(model: Resumable, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 def _append_newest(model: Resumable, world: World, arrays: dict[str, np.ndarray]) -> None:
     """Add as many of the newest transitions as that side of the buffer holds."""
-    newest = {name: array[-model.replay_buffer.side(world).buffer_size :] for name, array in arrays.items()}
+    capacity, given = model.replay_buffer.side(world).buffer_size, len(arrays["actions"])
+    if given > capacity:
+        warnings.warn(
+            f"of {given} {world} transitions the buffer takes the newest {capacity}; pass "
+            + ('replay_buffer_kwargs={"target_size": ...}' if world == "target" else "buffer_size="),
+            stacklevel=4,
+        )
+    newest = {name: array[-capacity:] for name, array in arrays.items()}
     model.replay_buffer.append(world, dones=newest.pop("terminations"), **newest)

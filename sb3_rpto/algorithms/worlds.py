@@ -50,7 +50,10 @@ class TargetLedger(VecEnvWrapper):
         """Count, then step."""
         if self._allowance is not None:
             if self._allowance < self.num_envs:
-                raise RuntimeError(f"the target-step budget is spent: {dict(self.spent)}")
+                raise RuntimeError(
+                    f"the target-step budget is spent: {dict(self.spent)}; a callback that evaluates needs an "
+                    "environment of its own, not model.target_env"
+                )
             self._allowance -= self.num_envs
         self.spent[self._purpose] += self.num_envs
         self.venv.step_async(actions)
@@ -159,7 +162,7 @@ def check_finite(world: str, **arrays: np.ndarray) -> None:
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(
-                f"the {world} environment returned a {name} that is not finite: {array}; "
+                f"the {world} environment returned, as {name}, what is not finite: {array}; "
                 "mend the environment (stable_baselines3.common.vec_env.VecCheckNan finds the step)"
             )
 

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, NamedTuple
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from torch import nn
@@ -64,6 +65,8 @@ class Dynamics(nn.Module, ABC):
         self.observation_space = observation_space
         self.action_space = action_space
         self.generator = th.Generator()
+        with th.random.fork_rng(devices=[]):  # unseeded where torch's own stream is, which goes on undisturbed
+            self.generator.manual_seed(int(th.randint(2**62, ())))
 
     def seed(self, seed: int) -> None:
         """Seed the model's own random stream (sampling, minibatches)."""
@@ -105,6 +108,22 @@ class Dynamics(nn.Module, ABC):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` returned."""
         self.generator.set_state(state["generator"].cpu())
+
+
+def predecessors(observations: np.ndarray, next_observations: np.ndarray) -> np.ndarray:
+    """The row that each transition goes on from, (n,); -1 where an episode begins.
+
+    Rows of several environments may be interleaved, as a target of several stores them.
+
+    :param observations: oldest first, (n, d)
+    :param next_observations: (n, d)
+    """
+    found, ends = np.full(len(observations), -1), dict[bytes, int]()
+    # Adding zero makes one zero of two.
+    for row, (begin, end) in enumerate(zip(observations + 0.0, next_observations + 0.0)):
+        found[row] = ends.pop(begin.tobytes(), -1)
+        ends[end.tobytes()] = row
+    return found
 
 
 def relative_error(predicted: th.Tensor, data: Transitions) -> float:

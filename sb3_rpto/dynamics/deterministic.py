@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from torch.nn import functional
 
-from sb3_rpto.dynamics.base import Prediction, Transitions
+from sb3_rpto.dynamics.base import Prediction, Transitions, predecessors
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics, TransitionFn
 
 #: Predictions are kept within so many standard deviations of the states that the scaler saw.
@@ -114,8 +115,8 @@ class DeterministicDynamics(EnsembleDynamics):
     ) -> dict[str, float]:
         """Take ``max_steps`` gradient steps of the open-loop loss.
 
-        Rows whose next observation is the observation of the row after them are followed; data that were shuffled
-        have none, and are fitted by one-step errors.
+        A row is followed by the one that begins where it ends, also where rows of several environments are interleaved;
+        samples without such rows are fitted by one-step errors.
 
         :param data: at least two transitions, oldest first
         :param weights: (n,), how often each row begins a sequence, not negative; None: all alike
@@ -128,7 +129,7 @@ class DeterministicDynamics(EnsembleDynamics):
         n_steps = self.max_steps if max_steps is None else max_steps
         horizon = min(self.horizon, len(data))
         dtype = self.input_mean.dtype
-        follows = (data.next_observations[:-1] == data.observations[1:]).all(dim=1)
+        following = self._successors(data)
         begins = th.ones(len(data), device=self.device) if weights is None else weights.float()
         begins = begins[: len(data) - horizon + 1]
         tensors = (data.observations, data.actions, data.next_observations, data.rewards, data.terminations)
@@ -136,11 +137,14 @@ class DeterministicDynamics(EnsembleDynamics):
         losses = []
         for _ in range(n_steps):
             first = begins.multinomial(self.batch_size, replacement=True, generator=self.generator)
-            rows = first + th.arange(horizon, device=self.device)[:, None]  # (H, b)
-            observations, actions, following, rewards, ends = (column[rows] for column in columns)
-            continues = follows[rows.clamp(max=len(follows) - 1)]
+            rows = [first]
+            for _ in range(horizon - 1):
+                after = following[rows[-1]]
+                rows.append(th.where(after >= 0, after, rows[-1]))
+            observations, actions, reached, rewards, ends = (column[th.stack(rows)] for column in columns)  # (H, b)
+            continues = following[th.stack(rows)] >= 0
             scale = self.target_std[:-1]
-            loss = open_loop_loss(self._following, observations, actions, following, continues, scale)
+            loss = open_loop_loss(self._following, observations, actions, reached, continues, scale)
             total = loss + self._head_loss(observations.flatten(0, 1), actions.flatten(0, 1), rewards, ends)
             self.optimizer.zero_grad()
             total.backward()
@@ -150,6 +154,13 @@ class DeterministicDynamics(EnsembleDynamics):
         last = th.stack(losses[-max(1, n_steps // 10) :])
         seconds = time.perf_counter() - started
         return {"open_loop_loss": float(last.mean()), "steps": float(n_steps), "fit_seconds": seconds}
+
+    def _successors(self, data: Transitions) -> th.Tensor:
+        """The row that goes on from each, (n,); -1 where there is none."""
+        before = predecessors(data.observations.cpu().numpy(), data.next_observations.cpu().numpy())
+        after = np.full(len(before), -1)
+        after[before[before >= 0]] = np.flatnonzero(before >= 0)
+        return th.as_tensor(after, device=self.device)
 
     def _following(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Next observations with gradient."""

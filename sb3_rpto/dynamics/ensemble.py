@@ -117,7 +117,8 @@ class EnsembleDynamics(Dynamics):
             raise ValueError(f"n_elites must be in 1..n_members ({n_members}), got {n_elites}")
         if not 0.0 < holdout_ratio <= 0.5:
             raise ValueError(f"holdout_ratio must be in (0, 0.5], got {holdout_ratio}")
-        for name, value in (("batch_size", batch_size), ("max_holdout", max_holdout), ("patience", patience)):
+        positive = {"batch_size": batch_size, "max_holdout": max_holdout, "patience": patience, "max_steps": max_steps}
+        for name, value in positive.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
         self.reward_fn = reward_fn

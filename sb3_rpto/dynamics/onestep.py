@@ -9,7 +9,7 @@ import numpy as np
 import torch as th
 from scipy.optimize import lsq_linear
 
-from sb3_rpto.dynamics.base import Transitions
+from sb3_rpto.dynamics.base import Transitions, predecessors
 from sb3_rpto.effects import Effect, Simulation
 from sb3_rpto.effects.sensors import ago, carry_on
 from sb3_rpto.effects.simulation import Drive
@@ -101,7 +101,7 @@ def as_steps(
 ) -> Steps:
     """Transitions as simulator steps; those with an unknown state (a speed at the observation's bound) are left out.
 
-    :param data: oldest first; a transition that begins where the one before it ended follows it
+    :param data: oldest first; a transition that begins where an earlier one ended follows it
     :param recover: states from observations
     :param model: the simulator's
     :param frame_skip: simulation steps in one transition
@@ -109,27 +109,26 @@ def as_steps(
     """
     earlier = -(-round(MEMORY / float(model.opt.timestep)) // frame_skip)
     chosen = np.arange(len(data)) if chosen is None else chosen
-    skipped = max(0, int(chosen.min(initial=len(data))) - earlier)
-    data = data.take(slice(skipped, None))
     arrays = (data.observations, data.next_observations, data.actions)
     observations, next_observations, actions = (a.cpu().numpy().astype(np.float64) for a in arrays)
-    now, then = recover(observations), recover(next_observations)
+    now, then = recover(observations[chosen]), recover(next_observations[chosen])
     known = np.concatenate([now.known_qpos & then.known_qpos, now.known_qvel & then.known_qvel], axis=1)
     ever = known.any(axis=0) | _known_at_rest(recover)
-    rows = np.intersect1d(np.flatnonzero(known[:, ever].all(axis=1)), chosen - skipped)
+    kept = np.flatnonzero(known[:, ever].all(axis=1))
+    rows = chosen[kept]
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = np.where(limited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf)).T
     commands = np.clip(actions, low, high)
-    follows = np.r_[False, (observations[1:] == next_observations[:-1]).all(axis=1)]
-    drive = np.repeat(_history(commands, follows, rows, earlier), frame_skip, axis=1)
-    begun, reached = (np.nan_to_num(np.concatenate([s.qpos, s.qvel], axis=1))[rows] for s in (now, then))
+    before = predecessors(observations, next_observations)
+    drive = np.repeat(_history(commands, before, rows, earlier), frame_skip, axis=1)
+    begun, reached = (np.nan_to_num(np.concatenate([s.qpos, s.qvel], axis=1))[kept] for s in (now, then))
     turned = list(now.wrapped)
     # The simulator counts whole turns on from where it begins; an observed angle jumps by one.
     reached[:, turned] -= 2 * np.pi * np.round((reached - begun)[:, turned] / (2 * np.pi))
     spread = (reached - begun).std(axis=0) if len(rows) else np.zeros(len(ever))
     qpos, qvel = np.split(begun, [model.nq], axis=1)
     scale = np.where(ever & (spread > 1e-8), np.maximum(spread, 1e-8), np.inf)
-    return Steps(rows + skipped, qpos, qvel, Drive(drive, earlier * frame_skip), reached, scale)
+    return Steps(rows, qpos, qvel, Drive(drive, earlier * frame_skip), reached, scale)
 
 
 def _known_at_rest(recover: StateMap) -> np.ndarray:
@@ -139,17 +138,17 @@ def _known_at_rest(recover: StateMap) -> np.ndarray:
     return np.concatenate([rest.known_qpos[0], rest.known_qvel[0]])
 
 
-def _history(commands: np.ndarray, follows: np.ndarray, rows: np.ndarray, earlier: int) -> np.ndarray:
+def _history(commands: np.ndarray, before: np.ndarray, rows: np.ndarray, earlier: int) -> np.ndarray:
     """The commands of the transitions at ``rows`` and of those before, (len(rows), earlier + 1, nu), oldest first.
 
     Before an episode's first transition the first command is taken to have held.
 
     :param commands: of all transitions, (n, nu)
-    :param follows: whether each begins where the one before it ended, (n,)
+    :param before: see :func:`sb3_rpto.dynamics.base.predecessors`
     """
     past, history = rows, [commands[rows]]
     for _ in range(earlier):
-        past = np.where(follows[past], past - 1, past)
+        past = np.where(before[past] >= 0, before[past], past)
         history.insert(0, commands[past])
     return np.stack(history, axis=1)
 

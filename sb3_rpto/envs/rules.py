@@ -63,6 +63,14 @@ def task_rules(env: gym.Env | VecEnv) -> TaskRules:
     return TaskRules(view.own_rule("reward_fn") or reward, termination)
 
 
+def env_id(env: VecEnv) -> str | None:
+    """Id of the first environment's specification, also of one in a subprocess whose specification does not pickle."""
+    if isinstance(env.unwrapped, DummyVecEnv):
+        spec = env.get_attr("spec", indices=[0])[0]
+        return spec.id if spec else None
+    return _View(env).id
+
+
 class _View:
     """Reads one environment, here or in a subprocess, without ever sending the environment itself."""
 

@@ -3,10 +3,12 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import ALGORITHMS, small
+from conftest import ALGORITHMS, SMALL_ENSEMBLE, pendulum, small
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3.common.monitor import Monitor
 
+from sb3_rpto import RPO, RPTO
 from sb3_rpto.algorithms import arguments
 
 VALUES = {
@@ -80,3 +82,40 @@ def test_what_is_not_supported_is_named(passed, named):
 def test_arguments_without_use_are_named():
     with pytest.raises(ValueError, match=r"RPO does not use \['declared', 'weighting'\]"):
         arguments.check_applicable("RPO", False, {"env", "weighting", "declared"})
+
+
+@pytest.mark.parametrize(
+    ("kinds", "error", "message"),
+    [(["coulomb"], ValueError, "close_loop.*coulomb_friction"), ("coulomb_friction", TypeError, "close_loop must be")],
+)
+def test_effects_to_look_for_are_checked_at_once(kinds, error, message):
+    env, target = (gym.make("InvertedDoublePendulum-v5") for _ in range(2))
+    with pytest.raises(error, match=message):
+        small(RPTO, env, target, dynamics="physical", dynamics_kwargs={}, close_loop=kinds)
+
+
+@pytest.mark.parametrize("rule", ["reward_fn", "termination_fn"])
+@pytest.mark.parametrize("answer", [lambda o, a, n: np.zeros(len(o)), lambda o, a, n: o])
+def test_rules_that_answer_in_another_form_are_refused_at_once(rule, answer):
+    with pytest.raises(ValueError, match=rf"dynamics_kwargs\['{rule}'\] must answer"):
+        small(RPTO, dynamics_kwargs={**SMALL_ENSEMBLE, rule: answer})
+
+
+def test_a_fit_of_no_steps_is_refused_at_once():
+    with pytest.raises(ValueError, match="max_steps must be at least 1"):
+        small(RPTO, dynamics_kwargs={**SMALL_ENSEMBLE, "max_steps": 0})
+
+
+def test_a_monitor_that_forbids_resets_is_refused_before_the_source_phase():
+    model = small(RPO, Monitor(pendulum(), allow_early_resets=False))
+    with pytest.raises(ValueError, match="allow_early_resets"):
+        model.learn(10)
+    assert model.source_timesteps == 0
+
+
+def test_a_batch_keeps_a_row_of_the_source():
+    model = small(RPO, real_ratio=0.99, batch_size=32, gradient_steps=5)
+    model.learn(20, source_timesteps=0)
+    assert model._n_updates == 100
+    batches = list(model.critic_batches(5, 32))
+    assert [len(b.rewards) for b in batches] == [32] * 5

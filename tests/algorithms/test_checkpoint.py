@@ -1,17 +1,27 @@
 """A checkpoint is complete: resuming equals not having stopped."""
 
+import threading
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from conftest import ALGORITHMS, SMALL_ENSEMBLE, SMALL_POLICY, pendulum, small
 from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_rpto import RPO, RPTO, RTO
+from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.buffers import chronological
+from sb3_rpto.callbacks import KeepBest
+from sb3_rpto.dynamics.ensemble import EnsembleDynamics
+from sb3_rpto.effects.model import numbers
 
 
 def assert_same(a, b):
@@ -294,6 +304,124 @@ def test_other_action_bounds_are_pointed_out():
     sac = SAC("MlpPolicy", gym.wrappers.RescaleAction(pendulum(), -1.0, 1.0), policy_kwargs=SMALL_POLICY)
     with pytest.warns(UserWarning, match="another action"):
         RPO.from_source(sac, pendulum(), target_env=pendulum(12.0))
+
+
+@pytest.mark.parametrize(
+    ("of_source", "passed", "expected"),
+    [
+        (0.1, {"ent_coef": 0.5}, 0.5),
+        (0.1, {"ent_coef": "auto"}, 0.1),
+        (0.1, {}, 0.1),
+        ("auto_0.03", {"ent_coef": "auto_0.5"}, 0.5),
+        ("auto_0.03", {"ent_coef": "auto"}, 0.03),
+        ("auto_0.03", {"ent_coef": 0.2}, 0.2),
+    ],
+)
+def test_the_temperature_is_the_sources_unless_another_is_asked_for(of_source, passed, expected):
+    sac = SAC("MlpPolicy", pendulum(), ent_coef=of_source, policy_kwargs=SMALL_POLICY, buffer_size=10)
+    assert float(small_from(sac, **passed).temperature()) == pytest.approx(expected)
+
+
+def test_a_source_phases_checkpoint_is_not_in_the_source_phase_once_loaded(tmp_path):
+    model = small(RTO, learning_starts=20)
+    model.set_logger(configure(str(tmp_path), []))
+    model.learn(10, source_timesteps=60)
+    loaded = RTO.load(tmp_path / "pretrain.zip", env=pendulum(), target_env=pendulum(12.0))
+    loaded.load_replay_buffer(tmp_path / "pretrain_replay_buffer.pkl")
+    before = [p.clone() for p in loaded.actor.parameters()]
+    loaded.learn(10, source_timesteps=0)
+    assert not loaded._pretraining
+    assert all(th.equal(a, b) for a, b in zip(before, loaded.actor.parameters()))  # RTO leaves the policy
+
+
+def test_a_warm_start_after_loading_is_saved(tmp_path):
+    small(RPO).save(tmp_path / "cold")
+    model = RPO.load(tmp_path / "cold")
+    model.set_parameters(model.get_parameters())
+    model.save(tmp_path / "warm")
+    assert RPO.load(tmp_path / "warm")._warm
+
+
+class WithDriver(gym.Wrapper):
+    """Knows its reward, and holds what does not pickle, as the driver of a robot does."""
+
+    def __init__(self, env, scale=1.0):
+        super().__init__(env)
+        self.lock, self.scale = threading.Lock(), scale
+
+    def reward_fn(self, observations, actions, next_observations):
+        return -self.scale * next_observations.square().sum(dim=1)
+
+    def termination_fn(self, observations, actions, next_observations):
+        return th.zeros(len(observations), dtype=th.bool)
+
+
+def test_rules_of_environments_that_do_not_pickle_are_read_again_after_loading(tmp_path):
+    def worlds():
+        return WithDriver(pendulum()), WithDriver(pendulum(12.0), 2.0)
+
+    source, target = worlds()
+    model = small(RPTO, source, target, model_train_freq=10)
+    model.save(tmp_path / "new")
+    model.learn(30, source_timesteps=0, callback=CheckpointCallback(15, tmp_path))
+    model.save(tmp_path / "learned")
+    rows = th.ones(4, 3), th.ones(4, 1), th.ones(4, 3)
+    assert (model.dynamics.reward_fn(*rows) == -6.0).all()
+    for name, expected in (("new", -3.0), ("learned", -6.0)):
+        source, target = worlds()
+        with pytest.raises(RuntimeError, match="pass env= and target_env="):
+            RPTO.load(tmp_path / name).dynamics.reward_fn(*rows)
+        loaded = RPTO.load(tmp_path / name, env=source, target_env=target)
+        assert (loaded.dynamics.reward_fn(*rows) == expected).all()
+
+
+def test_a_mujoco_simulator_is_saved_as_text_and_comes_back_to_the_last_bit(tmp_path):
+    env = hopper(-9.0)
+    env.unwrapped.model.body_mass[1] *= 1.01
+    model = small(RPTO, env, hopper(-12.0), dynamics="physical", declared=["option.gravity"], dynamics_kwargs={})
+    model.save(tmp_path / "m")
+    data, _, _ = load_from_zip_file(tmp_path / "m.zip")
+    assert data["dynamics_config"]["model"].text.startswith("<mujoco")
+    ours, theirs = (numbers(m) for m in (env.unwrapped.model, RPTO.load(tmp_path / "m").dynamics.model))
+    for name in ours:
+        np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
+
+
+def test_another_target_begins_without_the_data_and_the_best_policy_of_the_last():
+    model = small(RPO, stats_window_size=2)
+    model.learn(500, source_timesteps=0)
+    assert "best" in model.snapshots
+    with pytest.warns(UserWarning, match="loses 500 transitions"):
+        model.set_target_env(pendulum(14.0))
+    assert model.replay_buffer.target.size() == 0
+    assert (model.best_mean_reward, "best" in model.snapshots) == (-np.inf, False)
+
+
+def test_action_noise_survives_a_refused_run():
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.ones(1))
+    model = small(RPO, action_noise=noise)
+    with pytest.raises(ValueError, match="EvalCallback"):
+        model.learn(10, callback=KeepBest(), source_timesteps=0)
+    assert model.action_noise is noise
+
+
+def test_what_refills_the_source_of_a_corrected_simulator_is_that_simulator(tmp_path, monkeypatch):
+    model = small(RPTO, cartpole(), cartpole(pole_length=2.0), dynamics="physical", dynamics_kwargs={})
+    model.save(tmp_path / "m")
+    loaded = RPTO.load(tmp_path / "m", env=cartpole(), target_env=cartpole(pole_length=2.0))
+    loaded._source_world = loaded._make_source_world()
+    seen = []
+    monkeypatch.setattr(EpisodeSource, "interact", lambda world, *a, **k: seen.append(world.env) or 0)
+    warm._collect_in_source(loaded, 10)
+    assert seen == [loaded._source_world.env]
+    assert seen != [loaded.env]
+
+
+def test_unseeded_models_have_streams_of_their_own():
+    spaces = pendulum().observation_space, pendulum().action_space
+    rule = {"termination_fn": lambda o, a, n: o[:, 0] > 9}
+    first, second = (EnsembleDynamics(*spaces, **SMALL_ENSEMBLE, **rule) for _ in range(2))
+    assert first.generator.initial_seed() != second.generator.initial_seed()
 
 
 def test_parameters_set_by_hand_count_as_a_warm_start():

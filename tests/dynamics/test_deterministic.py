@@ -109,17 +109,27 @@ def test_the_same_question_has_one_answer():
     assert th.equal(answers[0].next_observations, answers[1].next_observations)
 
 
-def test_consecutive_rows_are_followed_and_shuffled_ones_are_not(monkeypatch):
+def test_rows_that_go_on_from_each_other_are_followed_and_no_others(monkeypatch):
     data, seen = one_trajectory(), []
     monkeypatch.setattr(deterministic, "open_loop_loss", lambda *given: seen.append(given) or open_loop_loss(*given))
     model = make()
     model.fit(data, max_steps=3)
-    model.fit(data.take(th.randperm(400, generator=th.Generator().manual_seed(0))), max_steps=3)
-    (_, observations, _, following, continues, _), shuffled = seen[0], seen[-1]
+    model.fit(data.take(th.arange(0, 400, 2)), max_steps=3)
+    (_, observations, _, following, continues, _), scattered = seen[0], seen[-1]
     assert continues[0].all()
     assert th.equal(following[0], observations[1])
     assert len(observations) == 2
-    assert shuffled[4][0].float().mean() < 0.05
+    assert not scattered[4][0].any()
+
+
+def test_interleaved_rows_of_several_environments_are_followed(monkeypatch):
+    data, seen = one_trajectory(), []
+    monkeypatch.setattr(deterministic, "open_loop_loss", lambda *given: seen.append(given) or open_loop_loss(*given))
+    order = th.arange(400).reshape(2, 200).T.reshape(-1)  # two halves, row by row
+    make().fit(data.take(order), max_steps=3)
+    _, observations, _, following, continues, _ = seen[0]
+    assert continues[0].float().mean() > 0.95
+    assert th.equal(following[0][continues[0]], observations[1][continues[0]])
 
 
 def test_an_ended_episode_is_not_followed(monkeypatch):

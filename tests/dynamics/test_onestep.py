@@ -109,6 +109,16 @@ def test_commands_from_before_count_and_end_where_a_transition_does_not_follow()
             np.testing.assert_array_equal(history(steps, first + i), expected)
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_interleaved_transitions_of_several_environments_keep_their_own_past(count):
+    parts = [collect(gym.make(POLE), 8, seed=seed, scale=0.05) for seed in range(count)]
+    every = steps_of(joined(*parts), POLE)
+    order = np.arange(8 * count).reshape(count, 8).T.reshape(-1)
+    mixed = steps_of(joined(*parts).take(th.as_tensor(order)), POLE)
+    np.testing.assert_array_equal(mixed.drive.commands, every.drive.commands[order])
+    np.testing.assert_array_equal(mixed.qpos, every.qpos[order])
+
+
 def test_commands_are_cut_as_the_actuators_cut_them():
     data = collect(gym.make(POLE), 4, scale=0.05)
     data.actions[:] = th.tensor([[5.0], [-5.0], [1.0], [3.5]])
