@@ -32,8 +32,8 @@ def calibrated(selector: Selector, base: Fit, chosen: list[int], sets: int, seed
 def largest_t(selector: Selector, base: Fit, chosen: list[int], seed: int) -> float:
     """The largest t of any effect on one complete set."""
     rng = np.random.default_rng(seed)
-    train = _complete(selector.train, base, rng)
-    select = None if selector.select is None else _complete(selector.select, selector.select.score(base.values), rng)
+    train = complete(selector.train, base, rng)
+    select = None if selector.select is None else complete(selector.select, selector.select.score(base.values), rng)
     ghost = Selector(train, select, selector.threshold, selector.say, selector.horizon)
     nothing = ghost.model((), base)
     joint, _ = ghost.together(chosen, nothing.fit)
@@ -42,7 +42,7 @@ def largest_t(selector: Selector, base: Fit, chosen: list[int], seed: int) -> fl
     return max(found, default=0.0)
 
 
-def _complete(problem: Problem, fit: Fit, rng: np.random.Generator) -> Problem:
+def complete(problem: Problem, fit: Fit, rng: np.random.Generator) -> Problem:
     """The same windows as the model itself would have been measured."""
     w = problem.windows
     values = np.tile(fit.values, (len(w), 1))

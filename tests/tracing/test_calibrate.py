@@ -1,11 +1,12 @@
 """The threshold of selection, measured on sets in which nothing is missing."""
 
 import numpy as np
+import pytest
 from simulated import problem, recorded
 
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
-from sb3_rpto.tracing.calibrate import calibrated, largest_t
+from sb3_rpto.tracing.calibrate import calibrated, complete, largest_t
 from sb3_rpto.tracing.select import Selector
 
 
@@ -28,7 +29,16 @@ def test_what_is_in_the_data_does_not_raise_the_threshold() -> None:
 def test_the_threshold_is_a_quantile_of_the_sets_and_the_same_for_a_seed() -> None:
     s = selector(0.0)
     base = s.model((), s.train.score(s.train.null)).fit
-    ts = [largest_t(s, base, [0, 1], seed) for seed in range(3)]
+    ts = [largest_t(s, base, [0, 1], seed) for seed in range(3, 6)]
     assert all(t >= 0 for t in ts)
-    assert len(set(ts)) > 1
-    assert calibrated(s, base, [0, 1], 3, 0) == np.quantile(ts, 0.95)
+    assert calibrated(s, base, [0, 1], 3, 3) == np.quantile(ts, 0.95)
+
+
+def test_a_complete_set_is_the_models_own_motion_with_the_estimated_noise() -> None:
+    s = selector(0.08)
+    base = s.model((), s.train.score(s.train.null)).fit
+    one, other = (complete(s.train, base, np.random.default_rng(seed)).windows for seed in (0, 1))
+    own = s.train.predict(np.tile(base.values, (len(one), 1)), base.starts, np.arange(len(one)))
+    noise = np.stack([(w.measured - own) / w.sigma for w in (one, other)])
+    assert noise.std(axis=(1, 2, 3)) == pytest.approx([1.0, 1.0], abs=0.1)
+    assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.1
