@@ -22,7 +22,7 @@ from sb3_rpto.effects.mjcf import restore, rounded, write_mjcf
 from sb3_rpto.effects.model import ModelSource, load_model
 from sb3_rpto.effects.names import near
 from sb3_rpto.effects.simulation import Simulation, prepare
-from sb3_rpto.effects.units import unit_at
+from sb3_rpto.effects.units import units_at
 from sb3_rpto.effects.world import LiveWorld
 from sb3_rpto.effects.wrapper import CorrectedEnv, active, own
 
@@ -146,7 +146,7 @@ def load_corrected(folder: str | os.PathLike[str]) -> Corrected:
 def _describe(effect: Effect, model: mujoco.MjModel) -> dict[str, Any]:
     entry = effect.to_json()
     entry["values"] = {name: float(value) for name, value in entry["values"].items()}
-    entry["unit"] = {p.name: unit_at(effect, p.unit, model) for p in effect.parameters}
+    entry["unit"] = {p.name: unit for p, unit in zip(effect.parameters, units_at(effect, model))}
     entry["equation"] = effect.equation
     entry["carried_by"] = carried_by(effect)
     if isinstance(effect, Declared):

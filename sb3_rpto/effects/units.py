@@ -10,15 +10,12 @@ from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.names import object_id
 
 
-def unit_at(effect: Effect, unit: str, model: mujoco.MjModel) -> str:
-    """The unit of a parameter where an effect sits: units are stated for hinges, a slide has m for rad and N for N·m.
-
-    :param unit: as in :class:`~sb3_rpto.effects.effect.Parameter`
-    """
-    joint = joint_of(effect, model)
+def units_at(effect: Effect, model: mujoco.MjModel) -> tuple[str, ...]:
+    """Units of an effect's parameters where it sits: stated for hinges, a slide has m for rad and N for N·m."""
+    units, joint = tuple(p.unit for p in effect.parameters), joint_of(effect, model)
     if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_SLIDE:
-        return unit
-    return unit.replace("kg·m²", "kg").replace("N·m", "N").replace("(N)", "N").replace("rad", "m")
+        return units
+    return tuple(u.replace("kg·m²", "kg").replace("N·m", "N").replace("(N)", "N").replace("rad", "m") for u in units)
 
 
 def joint_of(effect: Effect, model: mujoco.MjModel) -> int:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from sb3_rpto.effects import Declared
 from sb3_rpto.effects.carry import carried_by
-from sb3_rpto.effects.units import unit_at
 from sb3_rpto.tracing import causes, figures, wording
 from sb3_rpto.tracing.figures import Picture, horizon_label
 from sb3_rpto.version import __version__
@@ -124,9 +123,8 @@ def _model(report: Report) -> str:
     rows = []
     for t in report.declared:
         nominal = float(t.effect.nominal) if isinstance(t.effect, Declared) else float("nan")
-        for p, value, (low, high) in zip(t.effect.parameters, t.effect.values, t.interval.T):
+        for value, unit, (low, high) in zip(t.effect.values, t.units, t.interval.T):
             change = wording.percent(value / nominal - 1) if nominal else "–"
-            unit = unit_at(t.effect, p.unit, report.simulation.model)
             row = [t.label, wording.number(value), wording.interval(low, high), unit, wording.number(nominal), change]
             rows.append(row)
     header = ["declared parameter", "fitted", "95 % interval", "unit", "in the file", "change"]
@@ -145,8 +143,7 @@ def _effects(report: Report) -> str:
             f'<code class="equation">{escape(wording.with_numbers(t.effect))}</code>',
         ]
         rows = []
-        for p, value, (low, high) in zip(t.effect.parameters, t.effect.values, t.interval.T):
-            unit = unit_at(t.effect, p.unit, report.simulation.model)
+        for p, value, unit, (low, high) in zip(t.effect.parameters, t.effect.values, t.units, t.interval.T):
             rows.append([p.name, wording.number(value), wording.interval(low, high), unit])
         lines += [_table(["parameter", "value", "95 % interval", "unit"], rows, numbers=(1, 2)), _evidence(report, t)]
     return "\n".join(lines)

@@ -13,7 +13,6 @@ import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.carry import carried_by, save_corrected
-from sb3_rpto.effects.units import unit_at
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import Adequacy
 from sb3_rpto.tracing.checks import Finding
@@ -34,6 +33,7 @@ class Traced:
     """An effect with its fitted parameters.
 
     :param effect: with the values found
+    :param units: of its parameters where it sits
     :param interval: 95 % intervals of the parameters by resampling blocks, (2, p)
     :param alike: effects that explain the data as well: together they are its equivalence class
     :param gain: share of the typical window error that it saves
@@ -42,6 +42,7 @@ class Traced:
     """
 
     effect: Effect
+    units: tuple[str, ...]
     interval: np.ndarray
     alike: list[str]
     gain: float
@@ -55,9 +56,9 @@ class Traced:
 
     def __str__(self) -> str:
         parts = []
-        for p, value, (low, high) in zip(self.effect.parameters, self.effect.values, self.interval.T):
+        for p, value, unit, (low, high) in zip(self.effect.parameters, self.effect.values, self.units, self.interval.T):
             name = "" if isinstance(self.effect, Declared) else f"{p.name} "
-            parts.append(f"{name}{value:.4g} [{low:.4g}, {high:.4g}] {p.unit}".rstrip())
+            parts.append(f"{name}{value:.4g} [{low:.4g}, {high:.4g}] {unit}".rstrip())
         return f"{self.label} = {', '.join(parts)}"
 
 
@@ -171,9 +172,8 @@ class Report:
         rows = []
         for t in found:
             label = t.label
-            for p, value, (low, high) in zip(t.effect.parameters, t.effect.values, t.interval.T):
+            for p, value, unit, (low, high) in zip(t.effect.parameters, t.effect.values, t.units, t.interval.T):
                 name = "" if isinstance(t.effect, Declared) else p.name
-                unit = unit_at(t.effect, p.unit, self.simulation.model)
                 rows.append([label, name, wording.number(value), wording.interval(low, high), unit])
                 label = ""
         return rows
@@ -246,8 +246,8 @@ class Report:
             return {
                 "label": t.label,
                 "parameters": {
-                    p.name: {"value": v, "low": low, "high": high, "unit": unit_at(t.effect, p.unit, model)}
-                    for p, v, (low, high) in zip(t.effect.parameters, t.effect.values, t.interval.T)
+                    p.name: {"value": v, "low": low, "high": high, "unit": unit}
+                    for p, v, unit, (low, high) in zip(t.effect.parameters, t.effect.values, t.units, t.interval.T)
                 },
                 "equation": t.effect.equation,
                 "alike": t.alike,

@@ -13,6 +13,7 @@ import numpy as np
 from sb3_rpto.effects import LIBRARY, Declared, Effect, Simulation, declare
 from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.model import load_model
+from sb3_rpto.effects.units import units_at
 from sb3_rpto.tracing.adequacy import TOLERANCE, Adequacy
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
@@ -336,7 +337,11 @@ def _windows(
 def _declared(simulation: Simulation, values: np.ndarray, intervals: np.ndarray) -> list[Traced]:
     """The declared parameters with their fitted values."""
     pairs = zip(simulation.effects, simulation.slices)
-    return [Traced(e.with_values(values[s]), intervals[:, s], [], 0.0, 0.0, 1.0) for e, s in pairs if _is_declared(e)]
+    return [
+        Traced(e.with_values(values[s]), units_at(e, simulation.model), intervals[:, s], [], 0.0, 0.0, 1.0)
+        for e, s in pairs
+        if _is_declared(e)
+    ]
 
 
 def _kept(
@@ -355,7 +360,8 @@ def _kept(
         alike = [simulation.effects[j].label for j in selection.alike.get(i, [])]
         effect = simulation.effects[i].with_values(values[s])
         frequency = evidence.frequency(limit, rng)
-        found.append(Traced(effect, intervals[:, s], alike, evidence.gain, evidence.t, frequency))
+        units = units_at(effect, simulation.model)
+        found.append(Traced(effect, units, intervals[:, s], alike, evidence.gain, evidence.t, frequency))
     return found
 
 

@@ -505,8 +505,11 @@ def test_command(traced, tmp_path, capsys):
     assert tracing_benchmark.main(arguments) == 0
     assert "1 of 1 generated sets traced" in capsys.readouterr().out
     assert json.loads((tmp_path / "manifest.json").read_text())["command"].startswith("sb3-rpto benchmark tracing")
-    assert tracing_benchmark.main([*arguments, "--list"]) == 0
+    assert tracing_benchmark.main([*arguments[2:], "--list"]) == 0
     assert capsys.readouterr().out == "complete-pendulum-1mrad\n"
+    with pytest.raises(SystemExit):
+        tracing_benchmark.main(arguments[2:])
+    assert "--out DIR" in capsys.readouterr().err
     for bad, message in (
         (["--only", "["], "regular"),
         (["--only", "nothing"], "no case"),

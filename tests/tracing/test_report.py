@@ -12,7 +12,7 @@ from sb3_rpto.effects import Drive, Simulation
 from sb3_rpto.effects.carry import load_corrected
 from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.friction import CoulombFriction
-from sb3_rpto.effects.units import unit_at
+from sb3_rpto.effects.units import units_at
 from sb3_rpto.tracing import Report, wording
 from sb3_rpto.tracing.report import Traced, write_atomically
 
@@ -53,7 +53,7 @@ def test_text_has_the_verdict_the_effect_with_unit_and_the_errors(report: Report
 
 def test_text_says_where_an_effect_without_a_number_in_mjcf_is_carried(report: Report) -> None:
     delay = Traced(
-        CommandDelay("motor", delay=0.02), np.array([[0.01], [0.03]]), ["actuator_lag(motor)"], 0.5, 9.0, 1.0
+        CommandDelay("motor", delay=0.02), ("s",), np.array([[0.01], [0.03]]), ["actuator_lag(motor)"], 0.5, 9.0, 1.0
     )
     text = str(replace(report, effects=[delay], verdict="explained"))
     assert "the environment wrapper" in text
@@ -136,7 +136,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path)
 )
 def test_units_are_those_of_the_joint(effect, unit: str) -> None:
     model = mujoco.MjModel.from_xml_string(SLIDE)
-    assert unit_at(effect, effect.parameters[0].unit, model) == unit
+    assert units_at(effect, model)[0] == unit
 
 
 def test_units_of_slides_replace_angles() -> None:
@@ -145,9 +145,11 @@ def test_units_of_slides_replace_angles() -> None:
 
     model = mujoco.MjModel.from_xml_string(SLIDE)
     (damping,) = declare(model, ["rail.damping"])
-    assert unit_at(damping, damping.parameters[0].unit, model) == "N·s/m"
-    assert [unit_at(Spring("rail"), p.unit, model) for p in Spring.parameters] == ["N/m", "m"]
-    assert [unit_at(DCMotor("push"), p.unit, model) for p in DCMotor.parameters] == ["1/N", "s/m"]
+    assert units_at(damping, model) == ("N·s/m",)
+    assert units_at(Spring("rail"), model) == ("N/m", "m")
+    rail = Traced(Spring("rail"), units_at(Spring("rail"), model), np.zeros((2, 2)), [], 0.5, 9.0, 1.0)
+    assert "N/m," in str(rail)
+    assert units_at(DCMotor("push"), model) == ("1/N", "s/m")
 
 
 def test_joints_that_an_effect_acts_on() -> None:

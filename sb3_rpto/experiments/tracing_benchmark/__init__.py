@@ -17,7 +17,7 @@ NAME = "sb3-rpto benchmark tracing"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of :func:`run_benchmark`."""
-    parser.add_argument("--out", metavar="DIR", required=True, help="folder for the table; results go to DIR/cases")
+    parser.add_argument("--out", metavar="DIR", help="folder for the table; results go to DIR/cases")
     parser.add_argument("--scale", choices=SCALES, default="quick", help="20 or 205 sets (default: quick)")
     parser.add_argument("--workers", metavar="N", type=int, help="processes, of one thread each (default: one a core)")
     parser.add_argument("--only", metavar="REGEX", help="only sets whose id matches somewhere, e.g. '^single-.*1mrad'")
@@ -37,6 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if parsed.list:
         print("\n".join(case.id for case in selected(parsed.scale, parsed.only)))
         return 0
+    if parsed.out is None:
+        parser.error("--out DIR says where the table goes")
     return run_benchmark(parsed.out, parsed.scale, parsed.workers, not parsed.fresh, parsed.only)
 
 
