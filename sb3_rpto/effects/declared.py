@@ -308,12 +308,12 @@ def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:
 
 
 def _scalable(model: mujoco.MjModel, name: str) -> bool:
-    """Whether a wildcard should match: a factor on zero means nothing."""
+    """Whether a wildcard should match: a factor on zero means nothing, and a motor's null damping is its joint's."""
     try:
-        Declared(model, name)
+        found = Declared(model, name)
     except ValueError:
         return False
-    return True
+    return found.owner != "actuator" or found.nominal != 0
 
 
 def _bounds(entry: str, given: str) -> tuple[float, float]:

@@ -17,6 +17,8 @@ from sb3_rpto.effects.world import BatchWorld, World
 
 #: Actuators whose own state follows the command with a time constant, ``dynprm[0]``.
 FILTERS = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{name}")) for name in ("FILTER", "FILTEREXACT", "MUSCLE"))
+#: After so many time constants a filter has forgotten.
+CONSTANTS = 5
 
 
 class Drive(NamedTuple):
@@ -142,6 +144,7 @@ class Simulation:
 
     def _lead(self, world: BatchWorld, past: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Lead the actuators' own filters and delays through the commands before the start, the motion held there."""
+        past = past[:, max(0, past.shape[1] - math.ceil(memory(self.model) / self.model.opt.timestep)) :]
         if not past.shape[1]:
             return
         world.batch.bind("act")[:] = settled(self.model, past[:, 0])
@@ -230,6 +233,13 @@ class Switch:
             mask = self.last.reshape(*self.last.shape, *[1] * (on.ndim - 2))
             self.world.field(name)[:] = on * mask
         self.world.derive()  # the damping of actuators reaches the joints through derived constants
+
+
+def memory(model: mujoco.MjModel) -> float:
+    """Seconds of past commands that the model's own actuators remember, by filters and delays."""
+    filters = np.isin(model.actuator_dyntype, FILTERS)
+    own = CONSTANTS * model.actuator_dynprm[filters, 0]
+    return max(float(own.max(initial=0.0)), float(model.actuator_delay.max(initial=0.0)))
 
 
 def settled(model: mujoco.MjModel, ctrl: np.ndarray) -> np.ndarray:

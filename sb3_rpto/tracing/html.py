@@ -44,11 +44,11 @@ METHOD = (
     "Runs were parted into train, select and test as wholes; the test runs were predicted once, at the end.",
     "The declared parameters were fitted to short windows of the train runs, each simulated from its smoothed measured "
     "start under the recorded commands, with a robust cost in units of the measurement noise.",
-    "R compares the error of select windows with that of the same windows simulated from the fitted model with noise. "
+    "R compares the error of select windows with what the noise alone would leave in them, their starts being fitted. "
     "Where R reaches one, the model is complete and nothing more was tried.",
     "Otherwise each candidate effect was screened: could these data show it, and does it look like another?",
-    "All candidates that could show were fitted together, then dropped one by one: first the one whose loss costs "
-    "least on the select windows, until all that remained were needed.",
+    "All candidates that could show were fitted together, then dropped one by one: first those whose loss seems to "
+    "cost least, judged on the select windows, until all that remained were needed.",
     "An effect is needed when its loss raises the log error of blocks of select windows clearly (t above the "
     "threshold) and by more than 3 %; far from the noise, where other missing effects spread the blocks, a t of 2 is "
     "enough and a tenth is needed. Like effects were then tried in its place: those that do as well form its class.",
@@ -163,7 +163,7 @@ def _evidence(report: Report, t: Traced) -> str:
             f"saves {wording.percent(t.gain)} of the window error, t = {wording.number(t.t, 3)} where "
             f"{wording.number(report.threshold, 3)} is needed",
         ),
-        ("Stability", f"selected in {wording.percent(t.frequency)} of resampled data"),
+        ("Stability", f"clear in {wording.percent(t.frequency)} of resampled sets of blocks"),
         ("Carried", where),
     )
     return "<ul>" + "".join(f"<li>{escape(name)}: {escape(text)}</li>" for name, text in items) + "</ul>"

@@ -36,7 +36,10 @@ class Likes:
         self.kinds = [effect.kind for effect in self.effects]
 
     def substitute(self, selection: Selection) -> Selection:
-        """Try the likest other effects in the place of each kept one; keep the better, name those that do as well."""
+        """Try the likest other effects in the place of each kept one; keep the better, name those that do as well.
+
+        One that was there before is of the class unless the better one is clearly so.
+        """
         current = self._kind_everywhere(selection.model)
         for e in current.effects:
             best, alike = e, list[int]()
@@ -44,12 +47,14 @@ class Likes:
                 self.selector.say(f"{self.effects[e].label} or {self.effects[other].label}")
                 trial = self._exchanged(current, best, other)
                 if self._better(trial, current):
-                    current, alike, best = trial, [], other
+                    clear = self.selector.evidence(trial, current).clear(*self.selector.limit(trial))
+                    current, best, alike = trial, other, [] if clear else [*alike, best]
                 elif not self._better(current, trial):
                     alike.append(other)
                     if self._simpler(other, best):
+                        alike.append(best)
                         current, best = trial, other
-            selection.alike[best] = sorted({e, *alike} - {best})
+            selection.alike[best] = sorted({*alike} - {best})
         selection.model = current = self.simplest(current, selection)
         selection.alike = {
             e: [i for i in found if i not in current.effects]

@@ -35,6 +35,7 @@ class Measurements:
     :param findings: what a reader of the results must know; nothing is repaired without one
     :param unobserved: names of ``columns.qpos`` that were not measured: not to be compared with a prediction
     :param exact: whether the samples come from a simulator: no measurement noise, exact velocities
+    :param simulated: whether they come from the model's own steps in time, with noise
     """
 
     episodes: list[Episode]
@@ -42,6 +43,7 @@ class Measurements:
     findings: list[Finding] = field(default_factory=list)
     unobserved: tuple[str, ...] = ()
     exact: bool = False
+    simulated: bool = False
 
     @property
     def joints(self) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ class Traced:
     :param alike: effects that explain the data as well: together they are its equivalence class
     :param gain: share of the typical window error that it saves
     :param t: of that gain
-    :param frequency: share of resampled data in which it is selected
+    :param frequency: share of resampled sets of blocks in which that evidence is clear
     """
 
     effect: Effect
@@ -184,7 +184,7 @@ class Report:
             where = "in model.xml" if carried_by(t.effect) == "mjcf" else "in effects.json, by the environment wrapper"
             lines.append(
                 f"  {t.label}: saves {wording.percent(t.gain)} of the window error (t = {t.t:.1f}, needed "
-                f"{self.threshold:.1f}), selected in {wording.percent(t.frequency)} of resamples; carried {where}"
+                f"{self.threshold:.1f}), clear in {wording.percent(t.frequency)} of resamples; carried {where}"
             )
             if t.alike:
                 lines.append(f"    the data cannot tell it from {', '.join(t.alike)}")

@@ -20,10 +20,12 @@ class Screening:
 
     :param sensitivity: of each effect of the simulation, in units of noise for an effect of plausible size, (e,)
     :param cosine: likeness of the influences of effects, (e, e), 1 on the diagonal
+    :param taken: of each effect that shows only in what declared parameters do, the likest of them, else None, (e,)
     """
 
     sensitivity: np.ndarray
     cosine: np.ndarray
+    taken: list[int | None]
 
     def excited(self, effect: int) -> bool:
         """Whether the data could show this effect."""
@@ -66,7 +68,26 @@ def screen(problem: Problem, fit: Fit) -> Screening:
                 canonical = np.linalg.svd(roots[a] @ even[np.ix_(groups[a], groups[b])] @ roots[b].T, compute_uv=False)
                 # The smaller group must lie in the larger one.
                 cosine[a, b] = cosine[b, a] = float(np.clip(canonical.min(), 0, 1))
-    return Screening(sensitivity, cosine)
+    return Screening(sensitivity, cosine, _taken(problem, reduced.normal.sum(0), sensitivity))
+
+
+def _taken(problem: Problem, normal: np.ndarray, sensitivity: np.ndarray) -> list[int | None]:
+    """Of each effect the declared one that does the same, see :class:`Screening`.
+
+    :param normal: of all strengths, (f, f)
+    """
+    simulation = problem.simulation
+    strength = np.flatnonzero(simulation.strength)
+    groups = [np.flatnonzero(np.isin(strength, np.arange(s.start, s.stop))) for s in simulation.slices]
+    declared = [e for e, effect in enumerate(simulation.effects) if effect.kind == "declared"]
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-12))
+    likeness = np.abs(normal / size / size[:, None])
+    taken: list[int | None] = []
+    for e, g in enumerate(groups):
+        alone = np.sqrt(max(0.0, float(np.linalg.eigvalsh(normal[np.ix_(g, g)])[-1]))) if len(g) else 0.0
+        hidden = e not in declared and declared and sensitivity[e] < EXCITED <= alone
+        taken.append(max(declared, key=lambda d: float(likeness[np.ix_(groups[d], g)].max())) if hidden else None)
+    return taken
 
 
 def _orthogonal(normal: np.ndarray, known: np.ndarray) -> np.ndarray:

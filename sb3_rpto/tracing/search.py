@@ -93,6 +93,8 @@ def fit_declared(selector: Selector, seed: int) -> Fit:
     """Fit the declared parameters from several starts, none at a bound, and lead the best one on."""
     problem, free = selector.train, selector.free(())
     begin = problem.simulation.null.copy()
+    margin = np.minimum(0.5 * problem.size[free], 0.25 * (problem.upper - problem.lower)[free])
+    begin[free] = np.clip(begin[free], problem.lower[free] + margin, problem.upper[free] - margin)
     best = problem.fit(begin, free, iterations=20)
     if not len(free):
         return best
@@ -100,7 +102,6 @@ def fit_declared(selector: Selector, seed: int) -> Fit:
     for _ in range(STARTS - 1):
         start = begin.copy()
         step = rng.uniform(-3, 3, len(free)) * problem.size[free]
-        margin = np.minimum(0.5 * problem.size[free], 0.25 * (problem.upper - problem.lower)[free])
         start[free] = np.clip(begin[free] + step, problem.lower[free] + margin, problem.upper[free] - margin)
         other = problem.fit(start, free, iterations=20)
         if other.cost < 0.999 * best.cost:

@@ -158,7 +158,10 @@ class Selector:
         return self.model(chosen, replace(fit, starts=base.starts), 2 * REFIT)
 
     def model(self, effects: Sequence[int], begin: Fit, iterations: int = REFIT) -> Model:
-        """Fit a model from the optimum of another, without the effects that it lacks."""
+        """Fit a model from the optimum of another, without the effects that it lacks.
+
+        Where it ends worse than a smaller one is known to be, it begins again from that.
+        """
         key = tuple(sorted(effects))
         if key in self._memory:
             return self._memory[key]
@@ -166,7 +169,14 @@ class Selector:
         for i, s in enumerate(self.simulation.slices):
             if i not in key and self.simulation.effects[i].kind != "declared":
                 values[s] = self.simulation.null[s]
-        return self._remembered(key, self.train.fit(values, self.free(key), begin.starts, iterations, tolerance=3e-3))
+        free = self.free(key)
+        fit = self.train.fit(values, free, begin.starts, iterations, tolerance=3e-3)
+        known = [m.fit for m in self._memory.values() if {*m.effects} < {*key} and m.fit.cost < fit.cost]
+        if known:
+            smaller = min(known, key=lambda f: f.cost)
+            again = self.train.fit(smaller.values, free, smaller.starts, iterations, tolerance=3e-3)
+            fit = min(fit, again, key=lambda f: f.cost)
+        return self._remembered(key, fit)
 
     def led_on(self, model: Model) -> Model:
         """A model that errs more than need be, out of kinks that may hold its fit; exact data can be met exactly."""

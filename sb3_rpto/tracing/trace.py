@@ -14,16 +14,17 @@ from sb3_rpto.effects import LIBRARY, Declared, Effect, Simulation, declare
 from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.effects.units import units_at
-from sb3_rpto.tracing.adequacy import TOLERANCE, Adequacy
+from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE, Adequacy
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.model_checks import check_against
+from sb3_rpto.tracing.origin import origin
 from sb3_rpto.tracing.report import Candidate, Report, Traced
 from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary, typical
 from sb3_rpto.tracing.screen import Screening
-from sb3_rpto.tracing.search import Found, Selectors, find
+from sb3_rpto.tracing.search import Selectors, find
 from sb3_rpto.tracing.select import Selection, Selector
 from sb3_rpto.tracing.windows import Windows, cut, discretised, noise_levels
 
@@ -38,6 +39,8 @@ FEW = 40
 #: Where what is found leaves errors far above the noise, windows so many times as long show more of what is missing,
 #: and what only stands in for it shows too.
 LONGER = 2
+#: Windows count as stray, too, only where they err by so many times the typical error.
+APART = 3.0
 #: Most iterations of the last fits: where two parameters do nearly the same, a descent goes slowly along their valley.
 FINAL = 40
 
@@ -84,6 +87,16 @@ def trace(
     findings += [f for f in train.findings if f not in findings]
     fitted = replace(data, episodes=train.episodes + select.episodes)
     sigma = noise_levels(fitted)
+    length = _horizon(fitted) if horizon is None else horizon
+    seems = origin(compiled, fitted, declared, sigma, length, threads)
+    if seems != "machine":
+        data, train, select, test, fitted = (
+            replace(d, simulated=True, exact=seems == "exact") for d in (data, train, select, test, fitted)
+        )
+        sigma = noise_levels(fitted)
+        noise = "without noise" if data.exact else "with noise"
+        message = f"from the model's own steps in time, {noise}: they meet them better than the continuous motion does"
+        findings.append(Finding("simulated", "fitted runs", message))
     nominal = discretised(compiled, data, fine=True)
     known = declare(nominal, declared)
     twice = {d.label for d in known} & set(data.columns.params)
@@ -95,7 +108,6 @@ def trace(
     scales = typical(simulation, force_residuals(simulation, simulation.null, fitted)).scales(effects)
     coarse = Simulation(discretised(compiled, data, fine=False), effects, threads)
 
-    length = _horizon(fitted) if horizon is None else horizon
     longer = _longer(coarse.model, train, select, sigma, length) if horizon is None else None
 
     def selectors(horizon: float) -> Selectors:
@@ -106,7 +118,6 @@ def trace(
         )
 
     found = find(selectors, length, longer, seed, calibrate)
-    findings += _strays(found)
     selector, selection = found.on.fine, found.selection
     if selector.select is None:
         count = len(selector.train.windows)
@@ -125,6 +136,7 @@ def trace(
     residuals_before = force_residuals(simulation, before.values, data)
     residuals_after = force_residuals(simulation, final, data)
     unknown = np.full(nominal.nv, np.nan)  # where all runs are too short to differentiate
+    findings += _strays(selector, final, fitted, select, seed)
     unstable = problem.unstable(final)
     if unstable:
         message = f"in {unstable} of {len(problem.windows)} the corrected model became unstable; lower its timestep"
@@ -251,14 +263,29 @@ def judge(before: Adequacy, after: Adequacy, named: bool) -> str:
     return "partly explained" if halved else "unexplained"
 
 
-def _strays(found: Found) -> list[Finding]:
-    """Single windows that the final model misses, as a run that stalled or was touched leaves them."""
-    windows = len(found.on.fine.judging.windows)
-    count = round(found.after.strays * windows)
-    if not 0 < count < windows / 2:
-        return []
-    message = f"{count} of {windows} err by more than noise explains; the robust loss gives them little weight in fits"
-    return [Finding("stray windows", "windows judged on", message)]
+def _strays(
+    selector: Selector, values: np.ndarray, fitted: Measurements, select: Measurements, seed: int
+) -> list[Finding]:
+    """Windows that the final model misses by far, run by run: one that stalled or was touched leaves them.
+
+    :param fitted: recordings of the training windows first, then of those to select on
+    :param select: of the latter
+    """
+    parts = [(selector.train, fitted)] + ([(selector.select, select)] if selector.select else [])
+    fits = [problem.score(values) for problem, _ in parts]
+    errors = np.concatenate([fit.errors for fit in fits])
+    noise = np.concatenate([problem.noise_errors(fit, seed).ravel() for (problem, _), fit in zip(parts, fits)])
+    limit = max(BEYOND * float(np.quantile(noise, 0.99)), APART * float(np.median(errors)))
+    runs = np.array([data.episodes[i].run for problem, data in parts for i in problem.windows.episode])
+    stray = errors > limit
+    whole = [run for run in sorted({*runs[stray]}) if stray[runs == run].mean() > 0.5]
+    groups = [(f"run {run}", runs == run) for run in whole] + [("fitted runs", ~np.isin(runs, whole))]
+    message = "{} of {} windows err far more than the others; fits give them little weight (robust loss)"
+    return [
+        Finding("stray windows", where, message.format(int(stray[rows].sum()), int(rows.sum())))
+        for where, rows in groups
+        if stray[rows].any()
+    ]
 
 
 def _check_arguments(
@@ -388,6 +415,9 @@ def _candidate(
     for kept, others in selection.alike.items():
         if i in others:
             return Candidate(effect.label, "alike", f"explains the data as well as {labels[kept]}", sensitivity, alike)
+    declared = screening.taken[i]
+    if declared is not None:
+        return Candidate(effect.label, "alike", f"{labels[declared]} does the same", sensitivity, alike)
     if not screening.excited(i):
         return Candidate(effect.label, "not excited", f"to see it: {effect.excite}", sensitivity, alike)
     if i in selection.dropped:

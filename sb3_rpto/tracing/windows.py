@@ -11,14 +11,13 @@ import numpy as np
 
 from sb3_rpto.effects import Drive
 from sb3_rpto.effects.names import SCALAR_JOINTS, object_id, object_names
-from sb3_rpto.effects.simulation import FILTERS, names_of
+from sb3_rpto.effects.simulation import memory, names_of
 from sb3_rpto.tracing import checks
 from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.measurements import Measurements
 
-#: Seconds of commands kept from before a window, for effects that delay and filter; of the model's own filters so many
-#: time constants.
-MEMORY, CONSTANTS = 0.25, 5
+#: Seconds of commands kept from before a window, for effects that delay and filter: four constants of the slowest lag.
+MEMORY = 1.0
 #: Exact data (from a simulator) count as noisy by this share of a position's standard deviation.
 EXACT = 1e-4
 #: Least length of a block of windows in s; blocks count as independent.
@@ -158,8 +157,9 @@ def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco
     one, or takes MuJoCo's fast one.
     """
     copy = model.__copy__()
-    if not data.exact:
-        copy.opt.timestep = model.opt.timestep / math.ceil(model.opt.timestep / LONGEST - 1e-9)
+    if not (data.exact or data.simulated):
+        longest = min(LONGEST, float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes]))))
+        copy.opt.timestep = model.opt.timestep / math.ceil(model.opt.timestep / longest - 1e-9)
         if fine and stiff(copy):
             copy.opt.integrator = int(_IMPLICIT.get(model.opt.integrator, _FAST))
         elif fine:
@@ -197,13 +197,6 @@ def stiff(model: mujoco.MjModel) -> bool:
         rates[nv:, i] = (acceleration(unit, none) - acceleration(-unit, none)) / (2 * eps)
         rates[nv:, nv + i] = (acceleration(none, unit) - acceleration(none, -unit)) / (2 * eps)
     return bool(np.abs(np.linalg.eigvals(rates)).max(initial=0.0) * model.opt.timestep > STIFF)
-
-
-def memory(model: mujoco.MjModel) -> float:
-    """Seconds of past commands that the model's own actuators remember, by filters and delays."""
-    filters = np.isin(model.actuator_dyntype, FILTERS)
-    own = CONSTANTS * model.actuator_dynprm[filters, 0]
-    return max(float(own.max(initial=0.0)), float(model.actuator_delay.max(initial=0.0)))
 
 
 def first_sample(model: mujoco.MjModel, episode: Episode, exact: bool) -> int:
@@ -280,7 +273,9 @@ def _build(
         grid = t0 + h * np.arange(-before, steps)
         row = np.clip(np.searchsorted(e.time, grid + 1e-6 * h, side="right") - 1, 0, len(e) - 1)
         commands[w][:, actuators] = (
-            e.ctrl[row] if data.exact else held(e.time, e.ctrl, np.append(grid, grid[-1] + h) - half_step(model))
+            e.ctrl[row]
+            if data.exact or data.simulated
+            else held(e.time, e.ctrl, np.append(grid, grid[-1] + h) - half_step(model))
         )
         enabled[w][:, actuators] = e.enabled[row[before:]]
         n = end - begin - 1

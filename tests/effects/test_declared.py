@@ -66,6 +66,15 @@ def test_given_bounds() -> None:
             declare(MODEL, [wrong])
 
 
+def test_a_wildcard_leaves_out_a_motors_damping_that_is_null() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body name="pole"><joint name="hinge" damping="0.1"/><geom size=".1" pos="0 0 -1"/></body>
+        </worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+    )
+    assert [d.label for d in declare(model, ["*.damping"])] == ["hinge.damping"]
+    assert [d.label for d in declare(model, ["motor.damping"])] == ["motor.damping"]
+
+
 def test_wildcards() -> None:
     assert labels(["*.frictionloss"]) == ["hinge.frictionloss", "shared.frictionloss"]
     assert labels(["hinge.*"]) == ["hinge.damping", "hinge.frictionloss", "hinge.armature", "hinge.stiffness"]

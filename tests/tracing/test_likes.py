@@ -3,6 +3,7 @@
 import pytest
 from simulated import compiled, problem, recorded
 
+from sb3_rpto.effects.commands import ActuatorLag, CommandDelay
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction, ViscousFriction
 from sb3_rpto.tracing.likes import Likes
@@ -17,7 +18,21 @@ def test_substitution_replaces_a_wrong_effect_by_the_right_one() -> None:
     s = Selector(train, unseen, THRESHOLD, lambda what: None)
     nothing = train.score(train.null)
     wrong = s.model([1], nothing, 12)
-    assert Likes(s, screen(train, nothing)).substitute(Selection(wrong)).model.effects == (0,)
+    found = Likes(s, screen(train, nothing)).substitute(Selection(wrong))
+    assert found.model.effects == (0,)
+    assert found.alike[0] == []  # the wrong one is clearly worse, and so of no class with it
+
+
+def test_what_does_as_well_is_of_the_class() -> None:
+    """One pose of the motor tells no delay from a lag of the same few milliseconds."""
+    effects: list[Effect] = [CommandDelay("motor"), ActuatorLag("motor")]
+    planted = [ActuatorLag("motor", time_constant=0.004)]
+    train, unseen = (problem(effects, recorded(planted, noise=5e-3, seed=seed)) for seed in (2, 102))
+    s = Selector(train, unseen, THRESHOLD, lambda what: None)
+    nothing = train.score(train.null)
+    found = Likes(s, screen(train, nothing)).substitute(Selection(s.model([0], nothing, 12)))
+    (kept,) = found.model.effects
+    assert found.alike[kept] == [1 - kept]
 
 
 def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:

@@ -79,7 +79,8 @@ def test_coulomb_and_stribeck_friction_are_alike_and_so_are_lag_and_delay() -> N
 
 
 def test_what_is_not_excited_is_alike_to_nothing() -> None:
-    found = Screening(np.array([9.0, 9.0, 1.0]), np.array([[1, 0.99, 1], [0.99, 1, 0.5], [1, 0.5, 1]]))
+    cosine = np.array([[1, 0.99, 1], [0.99, 1, 0.5], [1, 0.5, 1]])
+    found = Screening(np.array([9.0, 9.0, 1.0]), cosine, [None] * 3)
     assert found.excited(1)
     assert not found.excited(2)
     assert found.alike(0) == [1]
@@ -97,6 +98,8 @@ def test_declared_damping_takes_viscous_friction_whole() -> None:
     # Dry friction keeps what viscous friction cannot do.
     assert EXCITED < held.sensitivity[1] < free.sensitivity[1]
     assert held.sensitivity[2] == 0
+    assert held.taken == [2, None, None]
+    assert free.taken == [None, None]
 
 
 def test_orthogonal_is_the_normal_matrix_of_what_a_projection_leaves() -> None:

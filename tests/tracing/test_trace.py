@@ -16,6 +16,7 @@ from simulated import PENDULUM, WITH_WHEEL, compiled, recorded
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_rpto.effects.carry import load_corrected
+from sb3_rpto.effects.commands import ActuatorLag
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.experiments.planting import Planted, generate
@@ -85,6 +86,28 @@ def parted(data: Measurements, parts: Sequence[str]) -> Measurements:
 
 
 # --- verdicts ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_slow_actuator_is_found_with_its_time_constant() -> None:
+    data = recorded([ActuatorLag("motor", time_constant=0.2)], compiled(COARSE), 8, 3.0, rate=100)
+    report = traced_simply(data, kinds=["actuator_lag", "command_delay"])
+    (lag,) = report.effects
+    assert report.verdict == "explained"
+    assert lag.effect.values == pytest.approx([0.2], rel=0.02)
+    assert lag.alike == []
+
+
+def test_a_run_that_stalled_is_named_also_where_others_are_judged_on() -> None:
+    data = few(9)
+    data = parted(data, ["train"] * 5 + ["select"] * 2 + ["test"] * 2)
+    stuck = data.episodes[0]
+    still = np.random.default_rng(3).normal(0.9, 1e-3, stuck.qpos.shape)
+    data.episodes[0] = replace(stuck, qpos=still, qvel=0 * stuck.qvel)
+    report = traced_simply(data, kinds=["coulomb_friction"])
+    (stray,) = [f for f in report.findings if f.kind == "stray windows"]
+    assert stray.where == "run 0"
+    assert stray.message.startswith("5 of 5 windows")
+    assert report.effects[0].interval[0, 0] < 0.08 < report.effects[0].interval[1, 0]
 
 
 @pytest.mark.parametrize("seed", [1, 2])

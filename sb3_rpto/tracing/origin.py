@@ -1,0 +1,64 @@
+"""Where do recordings come from: a machine, or the model's own simulation with noise on it?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal, TypeAlias
+
+import mujoco
+import numpy as np
+
+from sb3_rpto.effects import Simulation, declare
+from sb3_rpto.tracing.identify import Problem
+from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.residuals import force_residuals, typical
+from sb3_rpto.tracing.windows import cut, discretised, noise_levels
+
+#: Windows that are compared, and iterations of each fit.
+WINDOWS, ITERATIONS = 16, 10
+#: Typical window error, in units of the noise, that leaves nothing to ask.
+ENOUGH = 1.1
+#: They come from the model's own steps where those err by less than this share of what fine ones do.
+CLEARLY = 0.5
+#: They may be exact where their noise is less than this share of what exact ones count as noisy by.
+NOISELESS = 0.03
+
+Origin: TypeAlias = Literal["machine", "simulated", "exact"]
+
+
+def origin(
+    model: mujoco.MjModel, data: Measurements, declared: Sequence[str], sigma: np.ndarray, horizon: float, threads: int
+) -> Origin:
+    """Whether recordings seem to be a machine's, or the model's own with noise, or without any.
+
+    They are the model's own where its fit to the declared parameters meets them clearly better in its own steps in time
+    than in fine ones: a simulator's long semi-implicit steps err by more than many a sensor does. They are exact where
+    they hardly have noise and their states lead to one another as exact ones do.
+
+    :param model: as it was compiled
+    :param data: to fit to
+    :param declared: names of the parameters to fit
+    :param sigma: noise of each position column, (m,)
+    :param horizon: length of the windows in s
+    :param threads: that simulate
+    """
+    steps = {(m.opt.timestep, m.opt.integrator) for m in (model, discretised(model, data, fine=True))}
+    if data.exact or len(steps) == 1:
+        return "machine"
+
+    def error(kind: Measurements, noise: np.ndarray) -> float:
+        stepped = discretised(model, kind, fine=True)
+        known = declare(stepped, declared)
+        simulation = Simulation(stepped, known, threads)
+        scales = typical(simulation, force_residuals(simulation, simulation.null, kind)).scales(known)
+        problem = Problem(simulation, cut(stepped, kind, noise, horizon, WINDOWS), scales)
+        fit = problem.fit(simulation.null, np.arange(simulation.size), iterations=ITERATIONS)
+        return float(np.median(fit.errors))
+
+    continuous = error(data, sigma)
+    if continuous < ENOUGH or error(replace(data, simulated=True), sigma) > CLEARLY * continuous:
+        return "machine"
+    exact = replace(data, exact=True)
+    level = noise_levels(exact)
+    return "exact" if np.all(sigma < NOISELESS * level) and error(exact, level) < ENOUGH else "simulated"

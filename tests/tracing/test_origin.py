@@ -1,0 +1,37 @@
+"""Recordings of a machine, and of a simulation in the model's own steps."""
+
+import numpy as np
+import pytest
+from simulated import compiled, recorded
+
+from sb3_rpto.effects.friction import CoulombFriction
+from sb3_rpto.tracing import trace
+from sb3_rpto.tracing.origin import origin
+
+#: semi-implicit steps of 5 ms err by far more than a tenth of a milliradian
+OWN = """<mujoco><option timestep="0.005"/><worldbody><body name="pole">
+<joint name="hinge" axis="0 -1 0" damping="0.05"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="0.5"/>
+</body></worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+DECLARED = ["hinge.damping", "pole.mass"]
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+def test_a_complete_simulator_that_was_logged_is_complete(noise: float) -> None:
+    data = recorded([], compiled(OWN), episodes=6, noise=noise)
+    report = trace(OWN, data, DECLARED, candidates=["coulomb_friction", "torque_offset"], threads=1)
+    assert report.verdict == "complete"
+    assert report.data.exact == (noise == 0)
+    assert [f.kind for f in report.findings].count("simulated") == 1
+    np.testing.assert_allclose([t.effect.values[0] for t in report.declared], [0.05, 0.5], rtol=1e-2)
+
+
+def test_a_machine_whose_motion_is_continuous_is_none() -> None:
+    fine = compiled(OWN.replace('timestep="0.005"', 'timestep="0.001" integrator="RK4"'))
+    data = recorded([], fine, episodes=3, noise=1e-4)
+    assert origin(compiled(OWN), data, DECLARED, np.array([1e-4]), 0.4, 1) == "machine"
+
+
+def test_what_is_missing_is_not_taken_for_steps() -> None:
+    fine = compiled(OWN.replace('timestep="0.005"', 'timestep="0.001" integrator="RK4"'))
+    data = recorded([CoulombFriction("hinge", level=0.1)], fine, episodes=3)
+    assert origin(compiled(OWN), data, DECLARED, np.array([1e-3]), 0.4, 1) == "machine"
