@@ -12,6 +12,7 @@ from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.world import World
 
 _LONGEST = 0.2  # s; a longer delay is a fault of the log
+_SLOWEST = 0.25  # s; of a slower lag the past that windows keep says too little
 
 
 @register
@@ -138,7 +139,7 @@ class ActuatorLag(Effect):
 
     kind = "actuator_lag"
     place = "actuator"
-    parameters = (Parameter("time_constant", "s", 0.01, lower=0.0, upper=2.0),)
+    parameters = (Parameter("time_constant", "s", 0.01, lower=0.0, upper=_SLOWEST),)
     equation = "time_constant dy/dt = u - y"
     excite = "commands that change quickly"
     order = 5
