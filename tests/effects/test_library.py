@@ -280,6 +280,21 @@ def test_delay_equation() -> None:
     assert sent("command_delay", RAMP, delay=0.2)[-1] == RAMP[0]
 
 
+def test_delay_is_mujocos_own_from_a_step_on() -> None:
+    """After the first commands; MuJoCo has zero before them, and a whole step in place of a shorter delay."""
+    xml = """<mujoco><option timestep="0.01"/><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>
+    <actuator><motor joint="j" delay="DELAY" nsample="8" interp="linear"/></actuator></mujoco>"""
+    for delay, same in ((0.01, 0.01), (0.02, 0.02), (0.025, 0.025), (0.005, 0.01)):
+        model = mujoco.MjModel.from_xml_string(xml.replace("DELAY", str(delay)))
+        data, native = mujoco.MjData(model), []
+        for u in RAMP:
+            data.ctrl[:] = u
+            mujoco.mj_step(model, data)
+            native.append(data.actuator_force[0])
+        np.testing.assert_allclose(native[3:], sent("command_delay", RAMP, delay=same)[3:], atol=1e-12)
+        assert native[0] == 0.0
+
+
 def test_other_command_equations() -> None:
     np.testing.assert_allclose(sent("command_deadband", RAMP, width=0.8), [0, 0.2, 1.2, 0.7, -0.2, -2.2, 0])
     np.testing.assert_allclose(sent("command_saturation", RAMP, inverse_limit=0.8), np.clip(RAMP, -1.25, 1.25))
