@@ -102,7 +102,7 @@ class Measurements:
             try:
                 with np.load(path, allow_pickle=False) as archive:
                     tables[path] = {name: archive[name] for name in archive.files}
-            except (zipfile.BadZipFile, EOFError, AttributeError) as error:  # the last: a single array
+            except (zipfile.BadZipFile, EOFError, AttributeError, TypeError) as error:  # the last two: a single array
                 raise ValueError(f"{path}: no whole npz archive of named arrays ({error}); write it again") from error
         return cls.from_tables(tables)
 
