@@ -21,7 +21,7 @@ from sb3_rpto import RPTO
 from sb3_rpto.algorithms import closing
 from sb3_rpto.callbacks import RelativityGapCallback
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
-from sb3_rpto.effects import LIBRARY, declare, parameter_names
+from sb3_rpto.effects import LIBRARY, Parameter, declare, parameter_names
 from sb3_rpto.effects.carry import carried_by
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.presets import preset_names, resolve_preset
@@ -150,7 +150,17 @@ def table_after(page: str, header: str) -> list[str]:
     return lines[start : next(i for i in range(start, len(lines)) if not lines[i].startswith("|"))]
 
 
-EFFECTS = "| kind | place | parameters (null) | equation | held by | left out where declared | what excites it |"
+EFFECTS = (
+    "| kind | place | parameters (null) | bounds | equation | held by | left out where declared | what excites it |"
+)
+
+
+def bounds(p: Parameter) -> str:
+    """What values a parameter may have."""
+    if np.isinf(p.upper):
+        return "any" if np.isinf(p.lower) else f"{p.lower:g} or more"
+    low, high = (f"{'-' * (end < 0)}pi" if abs(end) == np.pi else f"{end:g}" for end in (p.lower, p.upper))
+    return f"{low} to {high}"
 
 
 def effect_rows() -> list[str]:
@@ -164,7 +174,8 @@ def effect_rows() -> list[str]:
             )
             native = f"`{kind.native}`" if carried_by(kind("anywhere")) == "mjcf" else "wrapper"
             same = ", ".join(f"`{name}`" for name in kind.same)
-            cells = [f"`{kind.kind}`", place, parameters, f"`{kind.equation}`", native, same, kind.excite]
+            limits = "; ".join(map(bounds, kind.parameters))
+            cells = [f"`{kind.kind}`", place, parameters, limits, f"`{kind.equation}`", native, same, kind.excite]
             row = "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
             rows.append(row.replace("|  |", "| |"))
     return rows
@@ -190,8 +201,8 @@ def declared_rows() -> list[str]:
         owner, _, parameter = name.rpartition(".")
         (known,) = declare(model, [name])
         (p,) = known.parameters
-        bounds = f"{p.lower:g} or more" if np.isinf(p.upper) else f"{p.lower / p.null:g} to {p.upper / p.null:g} times"
-        rows.append(f"| {owner} | `{parameter}` | {p.unit} | {bounds} |".replace("|  |", "| |"))
+        limits = bounds(p) if np.isinf(p.upper) else f"{p.lower / p.null:g} to {p.upper / p.null:g} times"
+        rows.append(f"| {owner} | `{parameter}` | {p.unit} | {limits} |".replace("|  |", "| |"))
     return rows
 
 

@@ -15,7 +15,7 @@ class Payload(Effect):
     r"""A point mass at a body: at :math:`p =` ``along`` :math:`\cdot c` from its origin, where c is its centre of mass.
 
     In the body's frame, with :math:`S(d) = |d|^2 1 - d d^T`: :math:`M' = M + m`, :math:`c' = (M c + m p) / M'`,
-    :math:`I' = I + M S(c - c') + m S(p - c')` (Steiner's theorem).
+    :math:`I' = I + M S(c - c') + m S(p - c')` (the parallel-axis theorem, Craig 2005): MuJoCo's ``inertial``.
     """
 
     kind = "payload"
@@ -69,7 +69,11 @@ class Armature(Effect):
 
 @register
 class LinkLength(Effect):
-    r"""A link :math:`(1 + r)` times as long, at its own density; see :mod:`sb3_rpto.effects.length`."""
+    r"""A link :math:`(1 + r)` times as long: points of its body move to :math:`x' = x + r\,(n \cdot x)\,n`.
+
+    :math:`n` is the axis of its longest capsule. As if the MJCF had another ``fromto`` there, and MuJoCo took the
+    inertia from the geoms at their density (``inertiafromgeom``); see :mod:`sb3_rpto.effects.length`.
+    """
 
     kind = "link_length"
     place = "body"
@@ -102,7 +106,10 @@ class LinkLength(Effect):
 
 @register
 class GravityTilt(Effect):
-    r"""A base that is not level: gravity becomes :math:`R_x(\alpha)\,R_y(\beta)\,g`."""
+    r"""A base that is not level: gravity becomes :math:`g' = R_x(\alpha)\,R_y(\beta)\,g`; MuJoCo's ``option gravity``.
+
+    Turned about the world's y axis, then about its x axis (rotations about fixed axes, Craig 2005).
+    """
 
     kind = "gravity_tilt"
     place = "world"
@@ -128,7 +135,11 @@ class GravityTilt(Effect):
 
 @register
 class Wind(Effect):
-    """A steady wind that bodies meet in a fluid: MuJoCo's ``option wind``, where there is density or viscosity."""
+    r"""A steady wind, :math:`w' = w + (x, y, z)` in the world's frame: MuJoCo's ``option wind``.
+
+    Bodies meet it as a fluid that moves: the velocity in their drag (see :class:`Fluid`) is :math:`v - w'`. Without
+    density or viscosity it does nothing.
+    """
 
     kind = "wind"
     place = "world"
@@ -149,7 +160,18 @@ class Wind(Effect):
 
 @register
 class Fluid(Effect):
-    """A medium that drags every body by its size: MuJoCo's ``option density`` and ``viscosity`` (inertia boxes)."""
+    r"""A medium that drags every body by its size: MuJoCo's ``option density`` and ``viscosity``.
+
+    With the model's own they make :math:`\rho` and :math:`\beta`. A body has an inertia box of half-sizes
+    :math:`r_i = \sqrt{3 (I_j + I_k - I_i) / (2 M)}`, of mean :math:`r`; the force and torque along its axes are
+
+    .. math::
+
+        f_i = -2 \rho\,r_j r_k |v_i| v_i - 6 \pi \beta\,r\,v_i, \qquad
+        g_i = -\tfrac12 \rho\,r_i (r_j^4 + r_k^4) |\omega_i| \omega_i - 8 \pi \beta\,r^3 \omega_i
+
+    (MuJoCo documentation, *Fluid forces*, inertia model; geoms with ``fluidshape="ellipsoid"`` have another).
+    """
 
     kind = "fluid"
     place = "world"
@@ -170,9 +192,10 @@ class Fluid(Effect):
 
 @register
 class GeomFriction(Effect):
-    """Another coefficient of sliding friction of a geom.
+    r"""Another coefficient of sliding friction of a geom, :math:`\mu' = \max(\mu + c, 0)`.
 
-    A contact has the larger coefficient of its two geoms: a smaller one shows where the other's is smaller still.
+    The first of MuJoCo's ``friction``. A contact has the larger coefficient of its two geoms (at unequal ``priority``
+    that of the higher): a smaller one shows where the other's is smaller still.
     """
 
     kind = "geom_friction"

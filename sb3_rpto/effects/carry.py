@@ -34,7 +34,7 @@ _HOOKS = ("act", "command", "observe", "late")
 class Corrected:
     """A corrected simulator.
 
-    :param model: with the numbers of every effect that MJCF can hold
+    :param model: with the numbers of every effect that ``model.xml`` holds
     :param effects: all effects, as changes of the **nominal** model; those for which :func:`carried_by` says
         ``"mjcf"`` are in ``model`` already
     """
@@ -43,7 +43,7 @@ class Corrected:
     effects: list[Effect]
 
     def simulation(self, nthread: int = 0) -> Simulation:
-        """Many of it side by side; its effects, and :meth:`Simulation.values`, are those that MJCF cannot hold.
+        """Many of it side by side; its effects, and :meth:`Simulation.values`, are those that its model does not hold.
 
         :param nthread: threads; 0: as many as there are cores
         """

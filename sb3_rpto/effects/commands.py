@@ -20,7 +20,8 @@ class CommandDelay(Effect):
     r"""The actuator receives :math:`u(t - d)`.
 
     A command is constant between two grid points, so the mean over a step of the delayed one is exactly the linear
-    interpolation between two past samples. Before the first sample its command is held.
+    interpolation between two past samples (sampled systems with a delay, Åström & Wittenmark 1997). Before the first
+    sample its command is held.
     """
 
     kind = "command_delay"
@@ -47,7 +48,10 @@ class CommandDelay(Effect):
 
 @register
 class CommandDeadband(Effect):
-    r"""A dead zone, :math:`u - \mathrm{clip}(u, -w, w)`: nothing below :math:`w`, and all above is less by it."""
+    r"""A dead zone, :math:`u - \mathrm{clip}(u, -w, w)`: nothing below :math:`w`, and all above is less by it.
+
+    The symmetric one of unit slope (Tao & Kokotović 1996).
+    """
 
     kind = "command_deadband"
     place = "actuator"
@@ -87,7 +91,10 @@ class CommandGain(Effect):
 
 @register
 class CommandSaturation(Effect):
-    r"""A limit of the amplifier, :math:`\mathrm{clip}(u, -1/s, 1/s)`, by its inverse: 0 is no limit."""
+    r"""A limit of the amplifier, :math:`\mathrm{clip}(u, -1/s, 1/s)`, by its inverse: 0 is no limit.
+
+    What a ``ctrlrange`` of MuJoCo does to a command, here before play and lag.
+    """
 
     kind = "command_saturation"
     place = "actuator"

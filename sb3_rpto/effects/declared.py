@@ -286,9 +286,12 @@ def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:
     """Look up declared parameters.
 
     :param model: the compiled model
-    :param names: ``<object>.<parameter>``, with shell wildcards (``*.damping``) and bounds (``arm.mass=0.2:0.9``)
-    :return: one :class:`Declared` for each name, in order, none twice
-    :raises ValueError: unknown names (the near ones are said), wildcards that match nothing, malformed bounds
+    :param names: ``<object>.<parameter>``, with shell wildcards (``*.damping``) and bounds in the parameter's SI unit
+        (``arm.mass=0.2:0.9``, kg)
+    :return: one :class:`Declared` for each name, in order, none twice: the last entry gives its bounds
+    :raises TypeError: one string in place of a list
+    :raises ValueError: unknown or ambiguous names (the near ones are said), wildcards that match nothing, malformed
+        bounds, bounds that do not hold the nominal value, a nominal value of zero where only factors make sense
     """
     if isinstance(names, str):
         raise TypeError(f"declared must be a list of names, not the string {names!r}; write [{names!r}]")

@@ -36,7 +36,10 @@ class TorqueRipple(Effect):
 
 @register
 class TorqueOffset(Effect):
-    """A constant torque, as of a biased amplifier or a cable that pulls: the same in both directions."""
+    r"""A constant torque :math:`c`, as of a biased amplifier or a cable that pulls: the same in both directions.
+
+    The offset of a joint's torque in the identification of robots (Gautier, Janot & Vandanjon 2013).
+    """
 
     kind = "torque_offset"
     place = "joint"

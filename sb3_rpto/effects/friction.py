@@ -95,7 +95,10 @@ class QuadraticDrag(Effect):
 
 @register
 class AsymmetricDamping(Effect):
-    r"""Viscous friction that depends on the direction: :math:`-c_+ \max(\dot q, 0) - c_- \min(\dot q, 0)`."""
+    r"""Viscous friction that depends on the direction: :math:`-c_+ \max(\dot q, 0) - c_- \min(\dot q, 0)`.
+
+    Friction of machines is often unequal in the two directions (Armstrong-Hélouvry, Dupont & Canudas de Wit 1994).
+    """
 
     kind = "asymmetric_damping"
     place = "joint"
@@ -173,7 +176,11 @@ class DirectionalLoadFriction(_LoadDependent):
 
 @register
 class PositionFriction(Effect):
-    r"""Dry friction that varies over a turn, as of a bent shaft: :math:`F = A\,(1 + \cos(q - \varphi)) / 2`."""
+    r"""Dry friction that varies over a turn, as of a bent shaft: :math:`F = A\,(1 + \cos(q - \varphi)) / 2`.
+
+    A mean and the first harmonic of friction that depends on the position (Armstrong-Hélouvry, Dupont & Canudas de
+    Wit 1994).
+    """
 
     kind = "position_friction"
     place = "joint"

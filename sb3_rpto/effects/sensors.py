@@ -46,7 +46,7 @@ class SensorDelay(Effect):
     r"""A sensor that is late, by its bus or its filter: it shows :math:`q(t - d)` and :math:`\dot q(t - d)`.
 
     Before an episode has lasted so long, it shows the first state. Where all sensors are as late as each other, the
-    recordings are those of late commands.
+    recordings are those of late commands. A constant delay from sensor to controller (Nilsson 1998).
     """
 
     kind = "sensor_delay"
@@ -62,7 +62,10 @@ class SensorDelay(Effect):
 
 @register
 class SensorBias(Effect):
-    """An encoder whose zero is wrong: it shows :math:`q + b`; the speed is right."""
+    """An encoder whose zero is wrong: it shows :math:`q + b`; the speed is right.
+
+    The joint offset of a robot's geometric calibration (Khalil & Dombre 2002).
+    """
 
     kind = "sensor_bias"
     place = "sensor"
@@ -81,7 +84,10 @@ class SensorBias(Effect):
 
 @register
 class SensorGain(Effect):
-    r"""A wrong scale of an encoder or potentiometer: it shows :math:`(1 + g)\,q` and :math:`(1 + g)\,\dot q`."""
+    r"""A wrong scale of an encoder or potentiometer: it shows :math:`(1 + g)\,q` and :math:`(1 + g)\,\dot q`.
+
+    The joint transducers' part of a robot's calibration (Mooring, Roth & Driels 1991).
+    """
 
     kind = "sensor_gain"
     place = "sensor"

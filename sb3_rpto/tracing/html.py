@@ -153,7 +153,7 @@ def _evidence(report: Report, t: Traced) -> str:
     where = (
         "in model.xml, which MuJoCo loads by itself"
         if carried_by(t.effect) == "mjcf"
-        else "in effects.json, put into the simulation by the environment wrapper: MJCF has no number for it"
+        else "in effects.json, put into the simulation by the environment wrapper: it is not in model.xml"
     )
     alike = f"the data cannot tell it from {', '.join(t.alike)}" if t.alike else "no other candidate does as well"
     items = (

@@ -66,9 +66,10 @@ class Measurements:
     def from_csv(cls, paths: Paths) -> "Measurements":
         """Read CSV files, also gzipped (``.csv.gz``); a file without an ``episode`` column is one episode.
 
-        :param paths: a path, a glob pattern, or several of them
+        :param paths: a path, a glob pattern, or several of them; a header and one row a sample, in SI units
         :raises FileNotFoundError: nothing matches
-        :raises ValueError: the data break the file format (see :meth:`from_tables`)
+        :raises ValueError: an empty file, a row of another length than the header, a broken gzip file, other text than
+            UTF-8, or data that break the file format (see :meth:`from_tables`)
         """
         return cls.from_tables({path: _read_csv(path) for path in _expand(paths)})
 
@@ -77,7 +78,9 @@ class Measurements:
         """Read Parquet files, as :meth:`from_csv` does.
 
         :param paths: as there
+        :raises FileNotFoundError: nothing matches
         :raises ImportError: pandas is not installed; pandas itself asks for pyarrow
+        :raises ValueError: no Parquet file, or data that break the file format (see :meth:`from_tables`)
         """
         try:
             import pandas
@@ -89,13 +92,19 @@ class Measurements:
 
     @classmethod
     def from_npz(cls, paths: Paths) -> "Measurements":
-        """Read npz archives with one array of shape (T,) for each column, as :meth:`from_csv` does."""
+        """Read npz archives with one array of shape (T,) for each column, as :meth:`from_csv` does.
+
+        :param paths: as there
+        :raises FileNotFoundError: nothing matches
+        :raises ValueError: no whole archive of named arrays, arrays of Python objects, or data that break the file
+            format (see :meth:`from_tables`)
+        """
         tables = {}
         for path in _expand(paths):
             try:
                 with np.load(path, allow_pickle=False) as archive:
                     tables[path] = {name: archive[name] for name in archive.files}
-            except (zipfile.BadZipFile, EOFError, AttributeError) as error:  # the last: a single array
+            except (zipfile.BadZipFile, EOFError, AttributeError, TypeError) as error:  # the last two: a single array
                 raise ValueError(f"{path}: no whole npz archive of named arrays ({error}); write it again") from error
         return cls.from_tables(tables)
 
@@ -103,9 +112,11 @@ class Measurements:
     def from_tables(cls, tables: Mapping[str, Table]) -> "Measurements":
         """Check tables of columns in memory and cut them into episodes.
 
-        :param tables: for each file name, its columns, all of shape (T,), in SI units
-        :raises ValueError: unknown, missing or differing columns, NaN or infinity, time that does not increase, too
-            few rows, a setting or a split that changes within an episode; the message names the place and the remedy
+        :param tables: for each file name, its columns, all of shape (T,): ``time`` in s, ``qpos`` in rad or m, ``qvel``
+            in rad/s or m/s, ``qfrc`` in N·m or N, ``ctrl`` in the actuators' units, ``enabled`` 0 or 1, ``param`` in SI
+        :raises ValueError: no tables; unknown, missing or differing columns, or such of unequal shape; what is no
+            number, NaN or infinity; time that does not increase, too few rows; a setting or a split that changes within
+            an episode, or a split of another name; the message names the place and the remedy
         """
         if not tables:
             raise ValueError("no tables; give at least one")
@@ -157,7 +168,8 @@ class Measurements:
             [-1, 1] as SB3 stores them
         :param env: the environment, with the wrappers that it had; it is neither reset nor stepped
         :param exact: whether the transitions come from a simulator; False for a machine behind the same observations
-        :raises ValueError: no MuJoCo model, states that cannot be recovered, NaN, no episode of two transitions
+        :raises ValueError: no buffer of vectors, no MuJoCo model, actions of another shape than the buffer's or the
+            actuators', states that cannot be recovered, NaN, no episode of two transitions
         """
         from sb3_rpto.tracing.replay import from_replay
 
@@ -169,18 +181,21 @@ class Measurements:
 
         :param dataset: a ``minari.MinariDataset``, or the id of one that is stored locally
         :param env: the environment of the data; None: the one that the dataset recovers
+        :raises FileNotFoundError: no dataset of this id is stored
         :raises ImportError: minari is not installed
-        :raises ValueError: as there
+        :raises ValueError: as there, or observations and actions that are no arrays
         """
         from sb3_rpto.tracing.replay import from_minari
 
         return from_minari(dataset, env)
 
     def tables(self) -> dict[str, np.ndarray]:
-        """All samples as one table of columns of shape (sum of T,), in the file format, for any writer.
+        """All samples as one table of columns of shape (sum of T,), in the file format and its units, for any writer.
 
         Repairs are in it: unwrapped angles, estimated velocities, one episode for each stretch between gaps (and one
         run, when read again).
+
+        :raises ValueError: there are no episodes
         """
 
         def join(arrays: Iterable[Any]) -> np.ndarray:

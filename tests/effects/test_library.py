@@ -1,5 +1,6 @@
 """Every effect of the library: it vanishes at its null, follows its equation, and is recovered where it was planted."""
 
+import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -279,6 +280,21 @@ def test_delay_equation() -> None:
     assert sent("command_delay", RAMP, delay=0.2)[-1] == RAMP[0]
 
 
+def test_delay_is_mujocos_own_from_a_step_on() -> None:
+    """After the first commands; MuJoCo has zero before them, and a whole step in place of a shorter delay."""
+    xml = """<mujoco><option timestep="0.01"/><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>
+    <actuator><motor joint="j" delay="DELAY" nsample="8" interp="linear"/></actuator></mujoco>"""
+    for delay, same in ((0.01, 0.01), (0.02, 0.02), (0.025, 0.025), (0.005, 0.01)):
+        model = mujoco.MjModel.from_xml_string(xml.replace("DELAY", str(delay)))
+        data, native = mujoco.MjData(model), []
+        for u in RAMP:
+            data.ctrl[:] = u
+            mujoco.mj_step(model, data)
+            native.append(data.actuator_force[0])
+        np.testing.assert_allclose(native[3:], sent("command_delay", RAMP, delay=same)[3:], atol=1e-12)
+        assert native[0] == 0.0
+
+
 def test_other_command_equations() -> None:
     np.testing.assert_allclose(sent("command_deadband", RAMP, width=0.8), [0, 0.2, 1.2, 0.7, -0.2, -2.2, 0])
     np.testing.assert_allclose(sent("command_saturation", RAMP, inverse_limit=0.8), np.clip(RAMP, -1.25, 1.25))
@@ -392,6 +408,24 @@ def test_world_effects_are_mujocos_own() -> None:
         np.testing.assert_array_equal(one_step(ARM, [effect]), one_step(edited(ARM, change), []))
 
 
+def test_fluid_and_wind_drag_the_inertia_box() -> None:
+    """The docstring's equations, on a box whose inertia box is itself."""
+    box = mujoco.MjModel.from_xml_string("""<mujoco><option timestep="0.001" density="1" gravity="0 0 0">
+    <flag eulerdamp="disable"/></option><worldbody><body><freejoint/><geom type="box" size=".1 .2 .3" mass="2"/>
+    </body></worldbody></mujoco>""")
+    rho, beta, wind = 1 + 3.0, 0.4, np.array([0.5, -1.0, 2.0])
+    sim = Simulation(box, [LIBRARY["fluid"](density=3.0, viscosity=beta), LIBRARY["wind"](x=0.5, y=-1.0, z=2.0)], 1)
+    qvel = np.array([1.0, -2.0, 0.5, 0.0, 0.0, 1.1])
+    got = sim.rollout(sim.values()[None], box.qpos0[None], qvel[None], Drive(np.zeros((1, 1, 0))))[1][0, 1]
+    v, w, inertia = qvel[:3] - wind, qvel[3:], np.sort(box.body_inertia[1])[::-1]  # of the x, y and z axis
+    r = np.sqrt(1.5 / 2 * (inertia.sum() - 2 * inertia))
+    np.testing.assert_allclose(r, [0.1, 0.2, 0.3])
+    rj, rk = np.roll(r, -1), np.roll(r, -2)
+    f = -2 * rho * rj * rk * abs(v) * v - 6 * np.pi * beta * r.mean() * v
+    g = -0.5 * rho * r * (rj**4 + rk**4) * abs(w) * w - 8 * np.pi * beta * r.mean() ** 3 * w
+    np.testing.assert_allclose((got - qvel) / 0.001, np.concatenate([f / 2, g / inertia]), rtol=1e-9, atol=1e-9)
+
+
 def test_tilt_turns_gravity() -> None:
     """About y by b, then about x by a: g (-sin b, sin a cos b, -cos a cos b)."""
     a, b = 0.1, -0.2
@@ -424,9 +458,12 @@ DIMENSIONLESS = {"mu", "mu_driving", "mu_driven", "change", "along"}
 
 @pytest.mark.parametrize("kind", ROWS)
 def test_statements(kind: str) -> None:
-    """Units, bounds, sizes, and the texts that reports show."""
+    """Units, bounds, sizes, the texts that reports show, and a docstring with the equation and where it is from."""
     effect = LIBRARY[kind]
     assert effect.__doc__
+    assert re.search(r":math:`[^`]+`", effect.__doc__), "the docstring lacks its equation"
+    source = r"\([^()]*\b(1[6-9]|20)\d\d\)|MuJoCo"  # a year in parentheses, or what it mirrors
+    assert re.search(source, effect.__doc__), "the docstring lacks its source"
     assert effect.equation
     assert effect.excite
     assert not all(p.shape for p in effect.parameters)

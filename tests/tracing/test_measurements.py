@@ -182,6 +182,12 @@ def test_no_tables_no_files():
         Measurements.from_npz("nothing/*.npz")
 
 
+def test_a_single_array_is_no_archive(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros(3))
+    with pytest.raises(ValueError, match="no whole npz archive of named arrays"):
+        Measurements.from_npz(tmp_path / "a.npy")
+
+
 def test_without_pandas_the_extra_is_named(monkeypatch):
     real = builtins.__import__
 
