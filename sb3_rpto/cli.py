@@ -26,6 +26,7 @@ FORMATS = {"csv": "from_csv", "parquet": "from_parquet", "npz": "from_npz"}
 #: Modules with ``main(arguments) -> exit code`` behind ``sb3-rpto benchmark NAME``.
 BENCHMARKS = {
     "tracing": "sb3_rpto.experiments.tracing_benchmark",
+    "threshold": "sb3_rpto.experiments.threshold",
     "speed": "sb3_rpto.experiments.speed",
     "transfer": "sb3_rpto.experiments.sweep",
     "report": "sb3_rpto.experiments.tables",

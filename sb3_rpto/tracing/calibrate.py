@@ -34,10 +34,18 @@ def largest_t(selector: Selector, base: Fit, chosen: list[int], seed: int) -> fl
     rng = np.random.default_rng(seed)
     train = complete(selector.train, base, rng)
     select = None if selector.select is None else complete(selector.select, selector.select.score(base.values), rng)
-    ghost = Selector(train, select, selector.threshold, selector.say, selector.horizon)
-    nothing = ghost.model((), base)
-    joint, _ = ghost.together(chosen, nothing.fit)
-    outcome = ghost.eliminate(Selection(joint), np.inf)
+    return strongest(Selector(train, select, selector.threshold, selector.say, selector.horizon), base, chosen)
+
+
+def strongest(selector: Selector, base: Fit, chosen: list[int]) -> float:
+    """The largest t of any effect, all of them fitted together and eliminated to the last.
+
+    :param selector: with windows in which nothing is missing
+    :param base: fit of the declared parameters
+    :param chosen: indices of the candidates
+    """
+    joint, _ = selector.together(chosen, selector.model((), base).fit)
+    outcome = selector.eliminate(Selection(joint), np.inf)
     found = [e.t for _, e in outcome.dropped.values() if isinstance(e, Evidence) and e.gain > 0]
     return max(found, default=0.0)
 

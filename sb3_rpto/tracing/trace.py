@@ -2,49 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 
-from sb3_rpto.effects import LIBRARY, Declared, Effect, Simulation, declare
-from sb3_rpto.effects.library import candidates as all_candidates
-from sb3_rpto.effects.model import load_model
+from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.units import units_at
 from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE, Adequacy
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.model_checks import check_against
-from sb3_rpto.tracing.origin import origin
+from sb3_rpto.tracing.prepare import Progress, SetUp, prepare
 from sb3_rpto.tracing.report import Candidate, Report, Traced
-from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary, typical
+from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary
 from sb3_rpto.tracing.screen import Screening
-from sb3_rpto.tracing.search import Selectors, find
+from sb3_rpto.tracing.search import find
 from sb3_rpto.tracing.select import Selection, Selector
-from sb3_rpto.tracing.windows import Windows, cut, discretised, noise_levels
+from sb3_rpto.tracing.windows import Windows
 
-#: Most windows to fit, and to select on.
-TRAIN, SELECT = 40, 40
-#: Few windows overlap by this share.
-OVERLAP = 2 / 3
-#: Seconds of training data that count as short.
-SHORT = 15.0
-#: Fewer windows than this overlap.
-FEW = 40
-#: Where what is found leaves errors far above the noise, windows so many times as long show more of what is missing,
-#: and what only stands in for it shows too.
-LONGER = 2
 #: Windows count as stray, too, only where they err by so many times the typical error.
 APART = 3.0
 #: Most iterations of the last fits: where two parameters do nearly the same, a descent goes slowly along their valley.
 FINAL = 40
-
-Progress = Callable[[float, str], None]
 
 
 def trace(
@@ -81,44 +64,11 @@ def trace(
     """
     _check_arguments(seed, candidates, horizon, calibrate, threads)
     say = _steady(progress)
-    spec, compiled = load_model(model)
-    findings = [*data.findings, *check_against(compiled, data)]
-    train, select, test = data.split(seed)
-    findings += [f for f in train.findings if f not in findings]
-    fitted = replace(data, episodes=train.episodes + select.episodes)
-    sigma = noise_levels(fitted)
-    length = _horizon(fitted) if horizon is None else horizon
-    seems = origin(compiled, fitted, declared, sigma, length, threads)
-    if seems != "machine":
-        data, train, select, test, fitted = (
-            replace(d, simulated=True, exact=seems == "exact") for d in (data, train, select, test, fitted)
-        )
-        sigma = noise_levels(fitted)
-        noise = "without noise" if data.exact else "with noise"
-        message = f"from the model's own steps in time, {noise}: they meet them better than the continuous motion does"
-        findings.append(Finding("simulated", "fitted runs", message))
-    nominal = discretised(compiled, data, fine=True)
-    known = declare(nominal, declared)
-    twice = {d.label for d in known} & set(data.columns.params)
-    if twice:
-        name = sorted(twice)[0]
-        raise ValueError(f"declared {name!r} is the column 'param.{name}' of the data, too; leave one of them out")
-    effects: list[Effect] = [*known, *_candidates(nominal, [d.label for d in known], candidates)]
-    simulation = Simulation(nominal, effects, threads)
-    scales = typical(simulation, force_residuals(simulation, simulation.null, fitted)).scales(effects)
-    coarse = Simulation(discretised(compiled, data, fine=False), effects, threads)
-
-    longer = _longer(coarse.model, train, select, sigma, length) if horizon is None else None
-
-    def selectors(horizon: float) -> Selectors:
-        overlap = 1 - length / horizon  # longer windows begin where the others do
-        fine, rough = (_windows(s.model, train, select, sigma, horizon, overlap) for s in (simulation, coarse))
-        return Selectors(
-            Selector.on(simulation, fine, scales, horizon, say), Selector.on(coarse, rough, scales, horizon, say), say
-        )
-
-    found = find(selectors, length, longer, seed, calibrate)
+    set_up = prepare(model, data, declared, seed, candidates, horizon, threads)
+    simulation, sigma, fitted = set_up.fine, set_up.sigma, set_up.fitted
+    found = find(lambda length: set_up.selectors(length, say), set_up.length, set_up.longer, seed, calibrate)
     selector, selection = found.on.fine, found.selection
+    findings = set_up.findings
     if selector.select is None:
         count = len(selector.train.windows)
         message = f"selected on {count} windows of the training runs by cross-validation over blocks"
@@ -126,17 +76,17 @@ def trace(
 
     say(0.85, "fitting the final model")
     parts = [p.windows for p in (selector.train, selector.select) if p is not None]
-    problem = Problem(simulation, parts[0] if len(parts) == 1 else join(*parts), scales)
+    problem = Problem(simulation, parts[0] if len(parts) == 1 else join(*parts), set_up.scales)
     final, intervals = refit(selection, problem, seed)
     # Both models are fitted to the same data before they are compared on the test runs.
     before = problem.fit(found.base.fit.values, selector.free(()), iterations=FINAL)
 
     say(0.9, "predicting the test runs")
-    data = test if test.episodes else fitted
+    data = set_up.test if set_up.test.episodes else fitted
     residuals_before = force_residuals(simulation, before.values, data)
     residuals_after = force_residuals(simulation, final, data)
-    unknown = np.full(nominal.nv, np.nan)  # where all runs are too short to differentiate
-    findings += _strays(selector, final, fitted, select, seed)
+    unknown = np.full(simulation.model.nv, np.nan)  # where all runs are too short to differentiate
+    findings += _strays(selector, final, set_up, seed)
     unstable = problem.unstable(final)
     if unstable:
         message = f"in {unstable} of {len(problem.windows)} the corrected model became unstable; lower its timestep"
@@ -160,14 +110,14 @@ def trace(
         noise=dict(zip(data.columns.qpos, sigma.tolist())),
         runs={
             name: sorted({e.run for e in part.episodes})
-            for name, part in (("train", train), ("select", select), ("test", test))
+            for name, part in (("train", set_up.train), ("select", set_up.select), ("test", set_up.test))
         },
         judged_apart=selector.select is not None,
         threshold=selector.limit(selection.model)[0],
         horizon=selector.horizon,
         seed=seed,
         # An environment may hold other numbers than its file, which the specification would lose.
-        source=model if spec is None or isinstance(model, gym.Env) else spec,
+        source=model if set_up.spec is None or isinstance(model, gym.Env) else set_up.spec,
         simulation=simulation,
         values_before=before.values,
         values_after=final,
@@ -263,15 +213,9 @@ def judge(before: Adequacy, after: Adequacy, named: bool) -> str:
     return "partly explained" if halved else "unexplained"
 
 
-def _strays(
-    selector: Selector, values: np.ndarray, fitted: Measurements, select: Measurements, seed: int
-) -> list[Finding]:
-    """Windows that the final model misses by far, run by run: one that stalled or was touched leaves them.
-
-    :param fitted: recordings of the training windows first, then of those to select on
-    :param select: of the latter
-    """
-    parts = [(selector.train, fitted)] + ([(selector.select, select)] if selector.select else [])
+def _strays(selector: Selector, values: np.ndarray, set_up: SetUp, seed: int) -> list[Finding]:
+    """Windows that the final model misses by far, run by run: one that stalled or was touched leaves them."""
+    parts = [(selector.train, set_up.fitted)] + ([(selector.select, set_up.select)] if selector.select else [])
     fits = [problem.score(values) for problem, _ in parts]
     errors = np.concatenate([fit.errors for fit in fits])
     noise = np.concatenate([problem.noise_errors(fit, seed).ravel() for (problem, _), fit in zip(parts, fits)])
@@ -299,66 +243,6 @@ def _check_arguments(
     for name, value in (("seed", seed), ("calibrate", calibrate), ("threads", threads)):
         if value < 0:
             raise ValueError(f"{name} is {value}; give a number from 0")
-
-
-def _candidates(model: mujoco.MjModel, declared: list[str], kinds: Sequence[str] | None) -> list[Effect]:
-    if kinds is not None:
-        unknown = [k for k in kinds if k not in LIBRARY]
-        if unknown:
-            raise ValueError(f"candidates: no effect {unknown[0]!r} is registered; known: {', '.join(sorted(LIBRARY))}")
-    return [e for e in all_candidates(model, declared) if kinds is None or e.kind in kinds]
-
-
-def _horizon(data: Measurements) -> float:
-    """Half a second, at least eight samples, at most a third of the longest episode.
-
-    Short data take 0.8 s: an effect shows more against the noise of so few windows.
-    """
-    step = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
-    lengths = [float(e.time[-1] - e.time[0]) for e in data.episodes]
-    usual = 0.5 if sum(lengths) >= SHORT else 0.8
-    return min(max(usual, 8 * step), max(max(lengths) / 3, 3 * step))
-
-
-def _longer(
-    model: mujoco.MjModel, train: Measurements, select: Measurements, sigma: np.ndarray, length: float
-) -> float | None:
-    """Length of the windows to go on with, in s, where the data hold enough of them to select on."""
-    longer = LONGER * length
-    episodes = (*train.episodes, *select.episodes)
-    if sum(int((e.time[-1] - e.time[0]) / longer) for e in episodes) < FEW // 2:
-        return None
-    try:
-        _windows(model, train, select, sigma, longer, 1 - length / longer)
-    except ValueError:  # in too few blocks
-        return None
-    return longer
-
-
-def _windows(
-    model: mujoco.MjModel,
-    train: Measurements,
-    select: Measurements,
-    sigma: np.ndarray,
-    horizon: float,
-    overlap: float,
-) -> tuple[Windows, Windows | None]:
-    """Windows to fit and to select on; None to select on where too little is set apart: then blocks take turns."""
-    if any(e.time[-1] - e.time[0] >= 2 * horizon for e in select.episodes):
-        judging = cut(model, select, sigma, horizon, SELECT, overlap)
-        # A single block is no evidence for anything.
-        if len(np.unique(judging.block)) > 1:
-            return cut(model, train, sigma, horizon, TRAIN, overlap), judging
-    train = replace(train, episodes=train.episodes + select.episodes)
-    every = cut(model, train, sigma, horizon, TRAIN + SELECT, overlap)
-    if len(every) < FEW:
-        every = cut(model, train, sigma, horizon, 2 * FEW, overlap=OVERLAP)
-        if len(np.unique(every.block)) < 3:
-            raise ValueError(
-                f"the training runs hold {len(every)} window(s) of {horizon:g} s in fewer than three blocks of a "
-                "second: too few to select on; record longer, or lower horizon"
-            )
-    return every, None
 
 
 def _declared(simulation: Simulation, values: np.ndarray, intervals: np.ndarray) -> list[Traced]:

@@ -1,0 +1,181 @@
+"""From a model and recordings to what the search works on: parts, noise, simulations, windows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from sb3_rpto.effects import LIBRARY, Effect, Scales, Simulation, declare
+from sb3_rpto.effects.library import candidates as all_candidates
+from sb3_rpto.effects.model import load_model
+from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.model_checks import check_against
+from sb3_rpto.tracing.origin import origin
+from sb3_rpto.tracing.residuals import force_residuals, typical
+from sb3_rpto.tracing.search import Selectors
+from sb3_rpto.tracing.select import Selector
+from sb3_rpto.tracing.windows import Windows, cut, discretised, noise_levels
+
+#: Most windows to fit, and to select on.
+TRAIN, SELECT = 40, 40
+#: Few windows overlap by this share.
+OVERLAP = 2 / 3
+#: Seconds of training data that count as short.
+SHORT = 15.0
+#: Fewer windows than this overlap.
+FEW = 40
+#: Where what is found leaves errors far above the noise, windows so many times as long show more of what is missing,
+#: and what only stands in for it shows too.
+LONGER = 2
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class SetUp:
+    """What the search works on.
+
+    :param spec: of the model; None where it was given compiled
+    :param findings: about the data
+    :param train: recordings to fit to
+    :param select: to decide on
+    :param test: that nothing but the report looks at
+    :param fitted: training runs first, then those to select on
+    :param sigma: noise of each position column, (m,)
+    :param fine: integrates finely, with all effects that may act
+    :param rough: integrates as the model does
+    :param scales: what is large at each effect's place
+    :param length: of the windows in s
+    :param longer: of the windows to go on with, in s; None: there are none
+    """
+
+    spec: mujoco.MjSpec | None
+    findings: list[Finding]
+    train: Measurements
+    select: Measurements
+    test: Measurements
+    fitted: Measurements
+    sigma: np.ndarray
+    fine: Simulation
+    rough: Simulation
+    scales: list[Scales]
+    length: float
+    longer: float | None
+
+    def selectors(self, horizon: float, say: Progress) -> Selectors:
+        """Selectors on windows of a length in s; longer ones begin where the others do."""
+        fine, rough = (
+            Selector.on(s, self._windows(s.model, horizon), self.scales, horizon, say) for s in (self.fine, self.rough)
+        )
+        return Selectors(fine, rough, say)
+
+    def _windows(self, model: mujoco.MjModel, horizon: float) -> tuple[Windows, Windows | None]:
+        return windows(model, self.train, self.select, self.sigma, horizon, 1 - self.length / horizon)
+
+
+def prepare(
+    model: Any,
+    data: Measurements,
+    declared: Sequence[str],
+    seed: int,
+    kinds: Sequence[str] | None,
+    horizon: float | None,
+    threads: int,
+) -> SetUp:
+    """Check the data against the model, part them, measure their noise, and set up the simulations.
+
+    Parameters and errors as :func:`sb3_rpto.tracing.trace.trace`.
+    """
+    spec, compiled = load_model(model)
+    findings = [*data.findings, *check_against(compiled, data)]
+    train, select, test = data.split(seed)
+    findings += [f for f in train.findings if f not in findings]
+    fitted = replace(data, episodes=train.episodes + select.episodes)
+    sigma = noise_levels(fitted)
+    length = _horizon(fitted) if horizon is None else horizon
+    seems = origin(compiled, fitted, declared, sigma, length, threads)
+    if seems != "machine":
+        data, train, select, test, fitted = (
+            replace(d, simulated=True, exact=seems == "exact") for d in (data, train, select, test, fitted)
+        )
+        sigma = noise_levels(fitted)
+        noise = "without noise" if data.exact else "with noise"
+        message = f"from the model's own steps in time, {noise}: they meet them better than the continuous motion does"
+        findings.append(Finding("simulated", "fitted runs", message))
+    nominal = discretised(compiled, data, fine=True)
+    known = declare(nominal, declared)
+    twice = {d.label for d in known} & set(data.columns.params)
+    if twice:
+        name = sorted(twice)[0]
+        raise ValueError(f"declared {name!r} is the column 'param.{name}' of the data, too; leave one of them out")
+    effects: list[Effect] = [*known, *_candidates(nominal, [d.label for d in known], kinds)]
+    fine = Simulation(nominal, effects, threads)
+    scales = typical(fine, force_residuals(fine, fine.null, fitted)).scales(effects)
+    rough = Simulation(discretised(compiled, data, fine=False), effects, threads)
+    longer = _longer(rough.model, train, select, sigma, length) if horizon is None else None
+    return SetUp(spec, findings, train, select, test, fitted, sigma, fine, rough, scales, length, longer)
+
+
+def _candidates(model: mujoco.MjModel, declared: list[str], kinds: Sequence[str] | None) -> list[Effect]:
+    if kinds is not None:
+        unknown = [k for k in kinds if k not in LIBRARY]
+        if unknown:
+            raise ValueError(f"candidates: no effect {unknown[0]!r} is registered; known: {', '.join(sorted(LIBRARY))}")
+    return [e for e in all_candidates(model, declared) if kinds is None or e.kind in kinds]
+
+
+def _horizon(data: Measurements) -> float:
+    """Half a second, at least eight samples, at most a third of the longest episode.
+
+    Short data take 0.8 s: an effect shows more against the noise of so few windows.
+    """
+    step = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
+    lengths = [float(e.time[-1] - e.time[0]) for e in data.episodes]
+    usual = 0.5 if sum(lengths) >= SHORT else 0.8
+    return min(max(usual, 8 * step), max(max(lengths) / 3, 3 * step))
+
+
+def _longer(
+    model: mujoco.MjModel, train: Measurements, select: Measurements, sigma: np.ndarray, length: float
+) -> float | None:
+    """Length of the windows to go on with, in s, where the data hold enough of them to select on."""
+    longer = LONGER * length
+    episodes = (*train.episodes, *select.episodes)
+    if sum(int((e.time[-1] - e.time[0]) / longer) for e in episodes) < FEW // 2:
+        return None
+    try:
+        windows(model, train, select, sigma, longer, 1 - length / longer)
+    except ValueError:  # in too few blocks
+        return None
+    return longer
+
+
+def windows(
+    model: mujoco.MjModel,
+    train: Measurements,
+    select: Measurements,
+    sigma: np.ndarray,
+    horizon: float,
+    overlap: float,
+) -> tuple[Windows, Windows | None]:
+    """Windows to fit and to select on; None to select on where too little is set apart: then blocks take turns."""
+    if any(e.time[-1] - e.time[0] >= 2 * horizon for e in select.episodes):
+        judging = cut(model, select, sigma, horizon, SELECT, overlap)
+        # A single block is no evidence for anything.
+        if len(np.unique(judging.block)) > 1:
+            return cut(model, train, sigma, horizon, TRAIN, overlap), judging
+    train = replace(train, episodes=train.episodes + select.episodes)
+    every = cut(model, train, sigma, horizon, TRAIN + SELECT, overlap)
+    if len(every) < FEW:
+        every = cut(model, train, sigma, horizon, 2 * FEW, overlap=OVERLAP)
+        if len(np.unique(every.block)) < 3:
+            raise ValueError(
+                f"the training runs hold {len(every)} window(s) of {horizon:g} s in fewer than three blocks of a "
+                "second: too few to select on; record longer, or lower horizon"
+            )
+    return every, None
