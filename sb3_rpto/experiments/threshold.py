@@ -1,4 +1,4 @@
-"""What threshold keeps effects from being named that are not there: ``sb3-rpto benchmark threshold``."""
+"""Which threshold names no effect that is not there: ``sb3-rpto benchmark threshold``."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Row = dict[str, Any]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure the largest t on complete generated sets that have no row yet, and print its quantile.
+    """Measure the threshold that complete generated sets need, those without a row, and print its quantile.
 
     :param arguments: without the program's name; default: those of the process
     :return: exit code
@@ -56,7 +56,7 @@ def measure(out: str | os.PathLike[str], sets: int) -> str:
     path = Path(out) / "threshold.json"
     rows: list[Row] = json.loads(path.read_text(encoding="utf-8"))["sets"] if path.exists() else []
     for i in range(len(rows), sets):
-        rows.append(largest(list(SYSTEMS)[i % len(SYSTEMS)], NOISES[i // len(SYSTEMS) % len(NOISES)], FIRST + i))
+        rows.append(needed(list(SYSTEMS)[i % len(SYSTEMS)], NOISES[i // len(SYSTEMS) % len(NOISES)], FIRST + i))
         ts = [row["t"] for row in rows]
         summary = {"level": LEVEL, "quantile": float(np.quantile(ts, LEVEL)), "shipped": THRESHOLD}
         made = {"command": f"{NAME} --sets {sets}", "commit": provenance.commit(), "versions": provenance.versions()}
@@ -64,11 +64,12 @@ def measure(out: str | os.PathLike[str], sets: int) -> str:
         write_atomically(path, json.dumps(summary | made | {"sets": rows}, indent=1) + "\n")
     ts = [row["t"] for row in rows[:sets]]
     above = sum(t > THRESHOLD for t in ts)
-    return f"{LEVEL:.0%} of {len(ts)} largest t are below {np.quantile(ts, LEVEL):.2f}; {above} exceed {THRESHOLD}"
+    least = np.quantile(ts, LEVEL)
+    return f"{LEVEL:.0%} of {len(ts)} complete sets need less than {least:.2f}; {above} need more than {THRESHOLD}"
 
 
-def largest(system: str, noise: float, seed: int, episodes: int = 10, duration: float = 4.0) -> Row:
-    """The largest t of any effect in a complete set, although adequacy would have ended the search before.
+def needed(system: str, noise: float, seed: int, episodes: int = 10, duration: float = 4.0) -> Row:
+    """The least threshold that names nothing in a complete set, although adequacy would have ended the search before.
 
     :param system: machine, one of ``SYSTEMS``
     :param noise: of the positions in rad or m

@@ -6,16 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from sb3_rpto.tracing.evidence import Evidence
 from sb3_rpto.tracing.identify import Fit, Problem
-from sb3_rpto.tracing.select import Selection, Selector
+from sb3_rpto.tracing.select import TRIED, Selection, Selector
 
-#: t* is this quantile of the largest t on complete data.
+#: t* is this quantile of the thresholds that complete sets need.
 LEVEL = 0.95
 
 
 def calibrated(selector: Selector, base: Fit, chosen: list[int], sets: int, seed: int) -> float:
-    """t*: what the largest t of an effect that is not there stays below in 95 % of complete sets.
+    """t*: the threshold that names no effect in 95 % of complete sets.
 
     Each set is simulated from the fitted declared model in the windows at hand, with the estimated noise; all chosen
     candidates are fitted to it and then eliminated to the last.
@@ -26,11 +25,11 @@ def calibrated(selector: Selector, base: Fit, chosen: list[int], sets: int, seed
     :param sets: number of sets; 20 leave one above the threshold
     :param seed: of the noise
     """
-    return float(np.quantile([largest_t(selector, base, chosen, seed + i) for i in range(sets)], LEVEL))
+    return float(np.quantile([needed(selector, base, chosen, seed + i) for i in range(sets)], LEVEL))
 
 
-def largest_t(selector: Selector, base: Fit, chosen: list[int], seed: int) -> float:
-    """The largest t of any effect on one complete set."""
+def needed(selector: Selector, base: Fit, chosen: list[int], seed: int) -> float:
+    """The least threshold that names nothing on one complete set, see :func:`strongest`."""
     rng = np.random.default_rng(seed)
     train = complete(selector.train, base, rng)
     select = None if selector.select is None else complete(selector.select, selector.select.score(base.values), rng)
@@ -38,16 +37,22 @@ def largest_t(selector: Selector, base: Fit, chosen: list[int], seed: int) -> fl
 
 
 def strongest(selector: Selector, base: Fit, chosen: list[int]) -> float:
-    """The largest t of any effect, all of them fitted together and eliminated to the last.
+    """The least threshold with which the elimination, begun with all effects together, leaves none of them.
+
+    Where it is stuck, the threshold rises to the least t of what it tried to drop.
 
     :param selector: with windows in which nothing is missing
     :param base: fit of the declared parameters
     :param chosen: indices of the candidates
     """
     joint, _ = selector.together(chosen, selector.model((), base).fit)
-    outcome = selector.eliminate(Selection(joint), np.inf)
-    found = [e.t for _, e in outcome.dropped.values() if isinstance(e, Evidence) and e.gain > 0]
-    return max(found, default=0.0)
+    outcome, level = selector.eliminate(Selection(joint), 0.0), 0.0
+    while outcome.model.effects:
+        current = outcome.model
+        rests = [[i for i in current.effects if i != e] for e in selector.removal_costs(current)[0][:TRIED]]
+        level = min(selector.evidence(current, selector.model(rest, current.fit)).t for rest in rests)
+        outcome = selector.eliminate(outcome, level)
+    return level
 
 
 def complete(problem: Problem, fit: Fit, rng: np.random.Generator) -> Problem:

@@ -103,13 +103,13 @@ def _without(report: Report, effect: Effect) -> list[ForceResidual]:
 
 
 def standard_residuals(report: Report) -> Picture | None:
-    """The force residual of the final model against velocity, position, load and command, joint by joint."""
+    """The force residual of the final model against velocity, position, load, command and time, joint by joint."""
     model = report.simulation.model
     dofs = wording.scalar_dofs(model)
     if not dofs or not report.residuals_after:
         return None
     shown = [dofs[i] for i in largest(report.force_after[dofs])]
-    causes = ["velocity", "position", "load", *(["command"] if model.nu else [])]
+    causes = ["velocity", "position", "load", *(["command"] if model.nu else []), "time"]
 
     def paint(axes: np.ndarray) -> None:
         for row, dof in zip(axes, shown):
@@ -124,7 +124,9 @@ def standard_residuals(report: Report) -> Picture | None:
         "that depends on the axis below. Noise of differentiated positions spreads the dots. For the eye only."
     )
     caption += left_out(len(dofs), len(shown))
-    return Picture("Missing force against four possible causes", draw(len(shown), len(causes), paint), caption)
+    return Picture(
+        "Force that is still missing, against its possible causes", draw(len(shown), len(causes), paint), caption
+    )
 
 
 def _residual(
@@ -141,10 +143,10 @@ def _residual(
     x = np.concatenate([_cause(r, dof, cause, _actuator(model, dof, actuator)) for r in residuals])
     y = np.concatenate([r.force[:, dof] for r in residuals])
     speed = np.concatenate([r.qvel[:, dof] for r in residuals])
-    if level:
+    if level or cause == "velocity":
         # At rest dry friction has no known sign.
         moving = np.abs(speed) > REST * np.quantile(np.abs(speed), 0.95)
-        x, y = x[moving], (y * np.sign(speed))[moving]
+        x, y = x[moving], (y * np.sign(speed) if level else y)[moving]
     if not len(x):
         return -1.0, 1.0
     some = np.linspace(0, len(x) - 1, min(POINTS, len(x))).astype(int)

@@ -211,7 +211,9 @@ def _forces(report: Report) -> str:
     shown = [causes.residual_of(report, t.effect) for t in report.effects[:FIGURES]]
     if len(report.effects) > FIGURES:
         lines.append(_note(f"The first {FIGURES} of {len(report.effects)} effects are drawn."))
-    lines += map(_picture, shown if report.effects else [causes.standard_residuals(report)])
+    if report.verdict != "explained":
+        shown.append(causes.standard_residuals(report))
+    lines += map(_picture, shown)
     return "\n".join(lines)
 
 

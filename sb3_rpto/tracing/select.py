@@ -14,7 +14,7 @@ from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.windows import Windows
 
-#: t*, between the 3 and 4 that complete data usually give as the 95 % quantile of the largest t; `calibrate` measures
+#: t*, above what 95 % of complete sets need to have nothing named (`benchmark threshold`); `calibrate` measures
 #: it for the data at hand.
 THRESHOLD = 3.5
 #: Typical window error, in units of the noise, above which it is the model's more than the noise's.
@@ -29,6 +29,8 @@ REFIT = 5
 JOINT = 15
 #: Effects whose removal raises the cost by less than this share, to second order, may go together.
 TRIFLE = 0.01
+#: So many of the cheapest effects are tried to be dropped one by one.
+TRIED = 3
 #: t from which on an effect seems to matter.
 SEEMS = 1.5
 #: Rounds of the look forward, after a joint fit and in its place, and candidates fitted in each.
@@ -315,7 +317,7 @@ class Selector:
 
 
 def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:
-    """What to try to drop: those that hardly matter, at most half of all at once, fewer, the cheapest three each."""
+    """What to try to drop: those that hardly matter, at most half of all at once, fewer, the cheapest few alone."""
     trifles = trifles[: (len(order) + 1) // 2]
     bundles = [trifles, trifles[: len(trifles) // 2], trifles[: len(trifles) // 4]] if len(trifles) > 1 else []
-    return [b for b in bundles if len(b) > 1] + [[e] for e in order[:3]]
+    return [b for b in bundles if len(b) > 1] + [[e] for e in order[:TRIED]]

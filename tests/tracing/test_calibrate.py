@@ -6,7 +6,7 @@ from simulated import problem, recorded
 
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
-from sb3_rpto.tracing.calibrate import calibrated, complete, largest_t
+from sb3_rpto.tracing.calibrate import calibrated, complete, needed
 from sb3_rpto.tracing.select import Selector
 
 
@@ -18,18 +18,18 @@ def selector(level: float) -> Selector:
 
 
 def test_what_is_in_the_data_does_not_raise_the_threshold() -> None:
-    """The sets are simulated from the declared model, so a planted effect must not show in their largest t."""
+    """The sets are simulated from the declared model, so a planted effect must not raise what they need."""
     s = selector(0.08)
     base = s.model((), s.train.score(s.train.null))
     everything = s.model((0, 1), base.fit, 10)
     assert s.evidence(everything, base).t > 10
-    assert largest_t(s, base.fit, [0, 1], seed=1) < 5
+    assert needed(s, base.fit, [0, 1], seed=1) < 5
 
 
 def test_the_threshold_is_a_quantile_of_the_sets_and_the_same_for_a_seed() -> None:
     s = selector(0.0)
     base = s.model((), s.train.score(s.train.null)).fit
-    ts = [largest_t(s, base, [0, 1], seed) for seed in range(3, 6)]
+    ts = [needed(s, base, [0, 1], seed) for seed in range(3, 6)]
     assert all(t >= 0 for t in ts)
     assert calibrated(s, base, [0, 1], 3, 3) == np.quantile(ts, 0.95)
 
