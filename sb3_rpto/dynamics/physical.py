@@ -89,6 +89,8 @@ class PhysicalDynamics(Dynamics):
     parameters' bounds and within a trusted size, so that the source moves smoothly towards the target; a step that
     would raise the error is shortened. Derivatives are finite differences, all columns and transitions in one
     :class:`mujoco.batch.Batch`. Parameters that the data do not show stay where they are, and are named in a warning.
+    Of those that the data show only together, such as a motor's gear and gain, the ones declared last stay, as many as
+    it takes for the others to be determined; they are named, too.
 
     The source world is the environment itself with phi in it (:meth:`effects`), so rewards, terminations and resets are
     the environment's own.
@@ -146,6 +148,7 @@ class PhysicalDynamics(Dynamics):
         self.threads = threads
         self._twin: CorrectedEnv | None = None
         self._unseen: tuple[str, ...] = ()
+        self._entangled: tuple[str, ...] = ()
         known: list[Effect] = [*declare(model, declared)]
         self._adopt([*known, *map(from_json, effects)])
 
@@ -175,17 +178,22 @@ class PhysicalDynamics(Dynamics):
 
     @property
     def deviation(self) -> np.ndarray:
-        """Standard deviation of phi in its units, (p,): of the last fit, robust against correlated errors; 0 before."""
+        """Standard deviation of phi in its units, (p,): of the last fit, robust against correlated errors; 0 before.
+
+        Infinite for a parameter that the data did not determine.
+        """
         return self._deviation.cpu().numpy()
 
     def effects(self, generator: np.random.Generator | None = None) -> list[Effect]:
         """Declared numbers and effects with the values of phi, for :class:`~sb3_rpto.effects.CorrectedEnv`.
 
-        :param generator: draws phi from its uncertainty, ``randomise`` times as wide; None: the estimate
+        :param generator: draws phi from its uncertainty, ``randomise`` times as wide, but for parameters that the data
+            did not determine; None: the estimate
         """
         values = self.values
         if generator is not None and self.randomise > 0:
-            values = values + self.randomise * self.deviation * generator.standard_normal(len(values))
+            known = np.where(np.isfinite(self.deviation), self.deviation, 0.0)  # nothing tells how far else to go
+            values = values + self.randomise * known * generator.standard_normal(len(values))
             values = np.clip(values, self._lower, self._upper)
         return [e.with_values(values[s]) for e, s in zip(self.simulation.effects, self.simulation.slices)]
 
@@ -318,6 +326,7 @@ class PhysicalDynamics(Dynamics):
             return {"steps": 0.0, "left_out": left_out}
         values, taken = self.values.copy(), 0
         problem = OneStep(self.simulation, self._scale, self._lower, self._upper, steps, weights)
+        problem.hold_what_is_not_determined(values)
         for _ in range(self.max_steps if max_steps is None else max_steps):
             moved = problem.step(values, self.max_step)
             if moved is None:
@@ -329,6 +338,7 @@ class PhysicalDynamics(Dynamics):
         self._values.copy_(th.as_tensor(values))
         self._deviation.copy_(th.as_tensor(problem.deviation(values)))
         self._name_unseen(problem.unseen)
+        self._name_entangled(problem.entangled, problem.held)
         return {"steps": float(taken), "left_out": left_out}
 
     def _name_unseen(self, unseen: np.ndarray) -> None:
@@ -341,6 +351,17 @@ class PhysicalDynamics(Dynamics):
                 stacklevel=3,
             )
         self._unseen = names
+
+    def _name_entangled(self, entangled: np.ndarray, held: np.ndarray) -> None:
+        """Warn once of parameters that the data do not tell apart."""
+        names, stay = (tuple(self.names[i] for i in np.flatnonzero(which)) for which in (entangled, held))
+        if set(names) - set(self._entangled):
+            warnings.warn(
+                f"the target's data do not tell {', '.join(names)} apart: {', '.join(stay)} left at what it was, the "
+                "rest is fitted to that and has no standard error; declare fewer of them, or add what is known of one",
+                stacklevel=3,
+            )
+        self._entangled = names
 
 
 def _name(effect: Effect, parameter: str) -> str:
