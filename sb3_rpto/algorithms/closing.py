@@ -16,6 +16,7 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Declared
 from sb3_rpto.envs.observations import single_env
 from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.tracing.report import Traced
 
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.transfer import TransferAlgorithm
@@ -35,6 +36,8 @@ FILL = 1_000
 ROUND, PATIENCE, FRESH = 20_000, 2, 100_000
 #: Another simulator made D_source where the present one errs by so much on the oldest so many of its transitions.
 OTHER, OLDEST = 0.02, 500
+#: Width of a normal distribution's 95 % interval, in standard deviations.
+WIDTH = 3.92
 #: A corrected simulator must stay finite for so many steps from states of the target, as the uncorrected one does.
 TRIAL_STATES, TRIAL_STEPS = 16, 20
 
@@ -135,12 +138,13 @@ class LoopCloser:
         :param before: error of ``data`` without them; infinite: no matter
         """
         known = {effect.label for effect in dynamics.effects()}
-        found = [traced.effect for traced in (*report.declared, *report.effects)]
+        all_traced = (*report.declared, *report.effects)
+        found = [traced.effect for traced in all_traced]
         new = [effect.label for effect in found if effect.label not in known and not isinstance(effect, Declared)]
-        kept = dynamics.effects()
-        dynamics.adopt(found)
+        kept = dynamics.effects(), dynamics.deviations()
+        dynamics.adopt(found, {traced.label: deviation_of(traced) for traced in all_traced})
         if not stays_finite(dynamics, data):
-            dynamics.replace(kept)
+            dynamics.replace(*kept)
             warnings.warn(
                 f"the simulator with {', '.join(new) or 'the traced values'} becomes unstable: refused, the last one "
                 "is kept; give bounds to what you declare",
@@ -148,7 +152,7 @@ class LoopCloser:
             )
             return []
         if before < math.inf and not dynamics.error(data) < (WORTH if new else 1.0) * before:
-            dynamics.replace(kept)
+            dynamics.replace(*kept)
             return []
         assert model.dynamics_config is not None
         model.dynamics_config["effects"] = dynamics.added()  # what a checkpoint rebuilds the model from
@@ -166,6 +170,12 @@ def _say(model: TransferAlgorithm, report: Report, added: list[str], data: str, 
     logger.record("gap/effects", ", ".join(added) or "none", exclude="tensorboard")
     if model.verbose:
         print(f"traced on {data}: {report.verdict}; {', '.join(added) or 'nothing'} added")
+
+
+def deviation_of(traced: Traced) -> np.ndarray:
+    """Standard deviation of the parameters that its interval is worth, (p,); infinite where the interval is unknown."""
+    low, high = traced.interval
+    return np.nan_to_num((high - low) / WIDTH, nan=np.inf)
 
 
 def stays_finite(dynamics: PhysicalDynamics, data: Transitions) -> bool:

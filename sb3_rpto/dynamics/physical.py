@@ -152,8 +152,8 @@ class PhysicalDynamics(Dynamics):
         known: list[Effect] = [*declare(model, declared)]
         self._adopt([*known, *map(from_json, effects)])
 
-    def _adopt(self, effects: Sequence[Effect]) -> None:
-        """Let phi be the values of these effects."""
+    def _adopt(self, effects: Sequence[Effect], deviations: Mapping[str, np.ndarray] | None = None) -> None:
+        """Let phi be the values of these effects, with deviations by their labels, 0 where none is told."""
         self.simulation = Simulation(self.model, effects, self.threads)
         gears = np.abs(self.model.actuator_gear[:, 0]) * np.max(
             np.abs(self.model.actuator_ctrlrange), axis=1, initial=0
@@ -167,7 +167,9 @@ class PhysicalDynamics(Dynamics):
         self._scale = np.maximum(np.abs(self.simulation.null), sizes)
         device = self._values.device if "_values" in self._buffers else None
         self.register_buffer("_values", th.as_tensor(values, dtype=th.float64, device=device))
-        self.register_buffer("_deviation", th.zeros(len(values), dtype=th.float64, device=device))
+        told = [(deviations or {}).get(e.label, np.zeros(len(e.parameters))) for e in self.simulation.effects]
+        deviation = np.concatenate([*told, np.zeros(0)])
+        self.register_buffer("_deviation", th.as_tensor(deviation, dtype=th.float64, device=device))
 
     # ------------------------------------------------------------------ phi
 
@@ -178,9 +180,9 @@ class PhysicalDynamics(Dynamics):
 
     @property
     def deviation(self) -> np.ndarray:
-        """Standard deviation of phi in its units, (p,): of the last fit, robust against correlated errors; 0 before.
+        """Standard deviation of phi in its units, (p,): of the last fit (robust against correlated errors) or trace.
 
-        Infinite for a parameter that the data did not determine.
+        0 before; infinite for a parameter that the data did not determine.
         """
         return self._deviation.cpu().numpy()
 
@@ -197,20 +199,26 @@ class PhysicalDynamics(Dynamics):
             values = np.clip(values, self._lower, self._upper)
         return [e.with_values(values[s]) for e, s in zip(self.simulation.effects, self.simulation.slices)]
 
-    def adopt(self, found: Sequence[Effect]) -> None:
+    def deviations(self) -> dict[str, np.ndarray]:
+        """:attr:`deviation` by the labels of the effects, each (number of its parameters,)."""
+        return {e.label: self.deviation[s] for e, s in zip(self.simulation.effects, self.simulation.slices)}
+
+    def adopt(self, found: Sequence[Effect], deviations: Mapping[str, np.ndarray] | None = None) -> None:
         """Take effects that were traced into phi, and the values that declared numbers had beside them.
 
         :param found: declared numbers by the names that were declared, and further effects
+        :param deviations: standard deviations of their parameters by their labels; 0 for those that are not told
         """
-        mine = {e.label: e for e in self.effects()}
+        mine, known = {e.label: e for e in self.effects()}, self.deviations()
         for effect in found:
             old = mine.get(effect.label)
             mine[effect.label] = effect if old is None else old.with_values(effect.values)
-        self._adopt(list(mine.values()))
+            known[effect.label] = np.zeros(len(effect.parameters))
+        self._adopt(list(mine.values()), {**known, **(deviations or {})})
 
-    def replace(self, effects: Sequence[Effect]) -> None:
-        """Let phi be exactly these effects with their values, as :meth:`effects` gave them."""
-        self._adopt(list(effects))
+    def replace(self, effects: Sequence[Effect], deviations: Mapping[str, np.ndarray]) -> None:
+        """Let phi be exactly these, as :meth:`effects` and :meth:`deviations` gave them."""
+        self._adopt(list(effects), deviations)
 
     def runs(self, data: Transitions, first: np.ndarray, length: int) -> bool:
         """Whether simulations from some of the target's states under its actions stay finite.

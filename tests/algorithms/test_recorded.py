@@ -242,6 +242,18 @@ def test_what_the_log_shows_joins_phi() -> None:
     assert "torque_offset(slider)" in [effect.label for effect in made._source_world.copies[0].effects]
 
 
+def test_what_the_trace_left_open_is_what_episodes_differ_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = learned()
+    traced = (*made.loop.reports[0].declared, *made.loop.reports[0].effects)
+    widths = np.concatenate([np.diff(t.interval, axis=0)[0] for t in traced])
+    assert (widths > 0).all()
+    np.testing.assert_allclose(made.dynamics.deviation, widths / 3.92)
+    monkeypatch.setattr(made.dynamics, "randomise", 2.0)
+    rng = np.random.default_rng(0)
+    drawn = np.array([np.concatenate([e.values for e in made.dynamics.effects(rng)]) for _ in range(200)])
+    np.testing.assert_allclose(drawn.std(axis=0), 2 * made.dynamics.deviation, rtol=0.2)
+
+
 def test_source_steps_are_counted_and_old_ones_dropped() -> None:
     made = learned()
     assert made.num_timesteps == 40

@@ -351,6 +351,19 @@ def test_adopt_keeps_the_values_of_what_it_is_not_told():
     np.testing.assert_array_equal(model.deviation, np.zeros(6))
 
 
+def test_adopt_takes_deviations_and_keeps_those_of_what_it_is_not_told(pole):
+    model = dynamics(POLE)
+    model.fit(noisy(pole, 1e-3), max_steps=3)
+    found = CommandDelay("slide", delay=0.03)
+    damping = model.effects()[1]
+    before, known = model.effects(), model.deviations()
+    model.adopt([found, damping], {found.label: np.array([0.002])})
+    np.testing.assert_array_equal(model.deviation, [known["pole.mass"][0], 0, 0.002])
+    model.replace(before, known)
+    assert model.names == list(SHIFTS[POLE])
+    np.testing.assert_array_equal(model.deviation, [*known["pole.mass"], *known["hinge.damping"]])
+
+
 def test_what_was_added_and_the_state_rebuild_the_model(pole):
     model = dynamics(POLE)
     model.adopt([CommandGain("slide", change=0.1), model.effects()[0].with_values(np.array([6.0]))])
