@@ -168,8 +168,17 @@ def _say(model: TransferAlgorithm, report: Report, added: list[str], data: str, 
     logger.record("gap/adequacy_after", report.adequacy_after.ratio)
     logger.record("gap/verdict", report.verdict)
     logger.record("gap/effects", ", ".join(added) or "none", exclude="tensorboard")
+    model.dump_logs()  # SB3 waits for the end of some episodes, before which a short run is over
     if model.verbose:
         print(f"traced on {data}: {report.verdict}; {', '.join(added) or 'nothing'} added")
+    if report.verdict == "unexplained":
+        warnings.warn(
+            f"the trace on {data} is 'unexplained': what it looked for does not account for the difference, and the "
+            "policy learns in a simulator that still errs; see print(model.loop.reports[-1]) for which joints, and "
+            "whether the observations hold the model's joints in its order, what else could be declared, and "
+            "dynamics='residual'",
+            stacklevel=3,
+        )
 
 
 def deviation_of(traced: Traced) -> np.ndarray:

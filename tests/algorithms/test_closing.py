@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 from collections import deque
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPTO
 from sb3_rpto.algorithms import closing
@@ -19,7 +22,7 @@ from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.tracing import Report
+from sb3_rpto.tracing import Report, trace
 
 TASK = "InvertedDoublePendulum-v5"
 KINDS = ["coulomb_friction", "torque_offset", "quadratic_drag"]
@@ -75,6 +78,27 @@ def test_an_undeclared_effect_is_named_added_and_fitted() -> None:
     values = dynamics(made).describe()
     assert values["coulomb_friction(slider).level"] == pytest.approx(LEVEL, rel=0.01)
     assert values["pole.length"] == pytest.approx(LENGTH * 0.6, rel=0.01)
+
+
+def test_a_trace_is_logged_before_any_episode_ends(soon: None, tmp_path: Path) -> None:
+    made = filled([])
+    made.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))
+    assert made.loop is not None
+    made.loop.close(made, dynamics(made))
+    (line,) = csv.DictReader((tmp_path / "progress.csv").open())
+    assert line["gap/verdict"] == "complete"
+    assert line["gap/effects"] == "none"
+    assert float(line["gap/residual_after"]) < 1e-3 < float(line["gap/residual_before"])
+
+
+def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = filled([])
+    monkeypatch.setattr(
+        closing, "trace", lambda *args, **kwargs: replace(trace(*args, **kwargs), verdict="unexplained")
+    )
+    assert made.loop is not None
+    with pytest.warns(UserWarning, match=r"on 101 target transitions is 'unexplained'.*reports\[-1\].*in its order"):
+        made.loop.close(made, dynamics(made))
 
 
 def test_no_target_step_is_spent_on_tracing() -> None:
