@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -32,6 +32,9 @@ from sb3_rpto.algorithms.worlds import (
     share_normalisation,
 )
 from sb3_rpto.envs.rules import task_rules
+
+if TYPE_CHECKING:
+    from sb3_rpto.algorithms.closing import LoopCloser
 
 #: The target's random stream is the seed plus this, so that both worlds never draw the same numbers.
 TARGET_SEED_OFFSET = 10_000
@@ -86,6 +89,8 @@ class TwoWorlds(PolicySnapshots):
     _null_check: NullShiftCheck | None
     #: whether the model has the target's rules, after its first fit
     _has_target_rules: bool
+    #: traces what the simulator lacks, where that was asked for
+    loop: LoopCloser | None
     #: the run's callbacks while it lasts: they know the step that SB3 has taken and not yet stored
     _callback: BaseCallback | None
     #: where a loaded checkpoint left the worlds, until ``learn()`` puts them back
@@ -96,7 +101,8 @@ class TwoWorlds(PolicySnapshots):
     def set_target_env(self, env: GymEnv | str) -> None:
         """Set the target; the next ``learn()`` starts a new episode there.
 
-        In the place of another target it begins with an empty D_target, and with no best policy.
+        In the place of another target it begins with an empty D_target, no best policy, and a closed loop that has seen
+        nothing.
 
         :param env: an environment, a VecEnv or an id
         :raises ValueError: when it is the source itself, has other spaces, or cannot be reset with a seed
@@ -109,6 +115,8 @@ class TwoWorlds(PolicySnapshots):
             check_pair(self.env, venv)
         if self.target_env is not None:  # what the last target told holds for it alone
             self.forget_best()
+            if self.loop is not None:
+                self.loop.forget_target()
             if self.replay_buffer.target.size() > 0:
                 warnings.warn(
                     f"D_target loses {self.replay_buffer.target.size()} transitions of the target before; to go on in "

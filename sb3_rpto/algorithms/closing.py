@@ -62,6 +62,10 @@ class LoopCloser:
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "reports": []}
 
+    def forget_target(self) -> None:
+        """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""
+        self._traced_at, self._error = 0, math.inf
+
     def due(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
         """Whether enough was seen for a first trace, or what is new is no longer predicted."""
         size = model.replay_buffer.target.size()

@@ -215,6 +215,19 @@ def test_another_trace_is_due_when_new_transitions_are_no_longer_predicted(
     assert loop.due(made, dynamics(made))
 
 
+def test_a_new_target_is_traced_anew(soon: None) -> None:
+    made = filled(friction())
+    assert made.loop is not None
+    made.loop.close(made, dynamics(made))
+    lacks: list[Effect] = [LIBRARY["torque_offset"]("hinge", offset=2.0)]
+    with pytest.warns(UserWarning, match="D_target loses 101"):
+        made.set_target_env(target(lacks))
+    append(made, lacks, 70)
+    assert not made.loop.due(made, dynamics(made))
+    append(made, lacks, 10)  # as many as a first trace takes
+    assert made.loop.due(made, dynamics(made))
+
+
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
