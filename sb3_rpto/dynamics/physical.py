@@ -220,19 +220,16 @@ class PhysicalDynamics(Dynamics):
         """Let phi be exactly these, as :meth:`effects` and :meth:`deviations` gave them."""
         self._adopt(list(effects), deviations)
 
-    def runs(self, data: Transitions, first: np.ndarray, length: int) -> bool:
-        """Whether simulations from some of the target's states under its actions stay finite.
+    def runs(self, observations: np.ndarray, actions: np.ndarray) -> bool:
+        """Whether simulations from some states under some actions stay finite.
 
-        :param data: transitions, oldest first
-        :param first: rows to start from
-        :param length: transitions to run on for
+        :param observations: of the states, (n, observation_dim)
+        :param actions: of the transitions from there on, (n, length, nu)
         """
-        states = self.recover(data.observations.cpu().numpy().astype(np.float64)[first])
-        actions = data.actions.cpu().numpy().astype(np.float64)
-        rows = np.minimum(first[:, None] + np.arange(length), len(actions) - 1)
-        commands = np.repeat(np.clip(actions[rows], *self._limits()), self.frame_skip, axis=1)
+        states = self.recover(observations.astype(np.float64))
+        commands = np.repeat(np.clip(actions.astype(np.float64), *self._limits()), self.frame_skip, axis=1)
         qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
-        values = np.tile(self.values, (len(first), 1))
+        values = np.tile(self.values, (len(observations), 1))
         true_state(self.simulation, values, qpos, qvel)
         q, v = self.simulation.rollout(values, qpos, qvel, Drive(commands))
         return bool(np.isfinite(q).all() and np.isfinite(v).all())

@@ -330,7 +330,8 @@ def test_a_trial_run_begins_at_the_true_state_not_at_what_a_biased_sensor_shows(
     model.adopt([SensorBias("hinge", offset=0.05)])
     begun, rollout = [], model.simulation.rollout
     monkeypatch.setattr(model.simulation, "rollout", lambda *a: begun.append(a[1].copy()) or rollout(*a))
-    assert model.runs(data, np.array([3, 7]), 5)
+    actions = data.actions.numpy()
+    assert model.runs(data.observations.numpy()[[3, 7]], np.stack([actions[3:8], actions[7:12]]))
     shown = data.observations[[3, 7], 1].numpy()  # the hinge's angle
     np.testing.assert_allclose(begun[0][:, 1], shown - 0.05, atol=1e-6)
 
