@@ -240,6 +240,16 @@ class PhysicalDynamics(Dynamics):
         low, high = np.where(limited[:, None], self.model.actuator_ctrlrange, (-np.inf, np.inf)).T
         return low, high
 
+    def declared_at_bounds(self) -> list[str]:
+        """Names and values of declared numbers that have moved to a bound."""
+        declared = np.array(
+            [isinstance(e, Declared) for e in self.simulation.effects for _ in e.parameters], dtype=bool
+        )
+        values = self.values
+        there = (values <= self._lower) | (values >= self._upper)
+        moved = declared & there & (values != self.simulation.null)
+        return [f"{self.names[i]} = {values[i]:.4g}" for i in np.flatnonzero(moved)]
+
     def added(self) -> list[dict[str, Any]]:
         """The effects beside the declared numbers, as ``effects=`` takes them."""
         return [e.to_json() for e in self.effects() if not isinstance(e, Declared)]
