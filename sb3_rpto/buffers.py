@@ -227,8 +227,14 @@ def load_transitions(
     :param world: the side that is read of a :class:`DualReplayBuffer`
     :param rewards_optional: whether an ``.npz`` may lack ``rew``; the result then has no ``rewards``
     :return: the arrays of :func:`chronological`
-    :raises ValueError: for a file with other contents, an empty set or values that are not finite
+    :raises ValueError: for a table, a file with other contents, an empty set or values that are not finite
     """
+    if isinstance(data, str | pathlib.Path) and str(data).endswith((".csv", ".parquet")):
+        reader = f"Measurements.from_{str(data).rpartition('.')[2]}({str(data)!r})"
+        raise ValueError(
+            f"{str(data)!r} is a table; transitions are read from a replay buffer, its pickle or an .npz file. For a "
+            f"robot's log pass target_data={reader} (from sb3_rpto.tracing)"
+        )
     if isinstance(data, str | pathlib.Path) and str(data).endswith(".npz"):
         arrays = _load_npz(data, rewards_optional)
     else:

@@ -1,4 +1,5 @@
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -165,6 +166,13 @@ def test_load_transitions_refuses_what_it_cannot_use(tmp_path):
     bad.append("source", **data)
     with pytest.raises(ValueError, match="rewards"):
         load_transitions(bad)
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log/*.csv", "log.parquet"])
+def test_load_transitions_says_how_tables_are_read(name):
+    kind = name.rpartition(".")[2]
+    with pytest.raises(ValueError, match=re.escape(f"pass target_data=Measurements.from_{kind}('{name}')")):
+        load_transitions(name)
 
 
 class Costly(ReplayBuffer):

@@ -61,6 +61,16 @@ def check_one_target(target_env: Any, target_data: Any) -> None:
         raise ValueError("target_env and target_data exclude each other: pass the target or a log of it")
 
 
+def list_of_names(declared: Sequence[str]) -> tuple[str, ...]:
+    """``declared=`` as a tuple.
+
+    :raises TypeError: for a single name, which would come apart into letters
+    """
+    if isinstance(declared, str):
+        raise TypeError(f"declared must be a list of names, not the string {declared!r}; write [{declared!r}]")
+    return tuple(declared)
+
+
 def check_applicable(algorithm: str, updates_dynamics: bool, passed: Collection[str]) -> None:
     """Refuse arguments that the algorithm has no use for.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -20,6 +20,7 @@ from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
+from sb3_rpto.algorithms.machine import check_machine, doubts
 from sb3_rpto.algorithms.snapshots import PolicySnapshots
 from sb3_rpto.algorithms.source import SourceWorld
 from sb3_rpto.algorithms.worlds import (
@@ -31,7 +32,11 @@ from sb3_rpto.algorithms.worlds import (
     find_ledger,
     share_normalisation,
 )
+from sb3_rpto.dynamics.factory import is_mujoco
 from sb3_rpto.envs.rules import task_rules
+
+if TYPE_CHECKING:
+    from sb3_rpto.algorithms.closing import LoopCloser
 
 #: The target's random stream is the seed plus this, so that both worlds never draw the same numbers.
 TARGET_SEED_OFFSET = 10_000
@@ -86,6 +91,10 @@ class TwoWorlds(PolicySnapshots):
     _null_check: NullShiftCheck | None
     #: whether the model has the target's rules, after its first fit
     _has_target_rules: bool
+    #: traces what the simulator lacks, where that was asked for
+    loop: LoopCloser | None
+    #: whether the simulator was judged after its first fit to this target
+    _judged_target: bool = False
     #: the run's callbacks while it lasts: they know the step that SB3 has taken and not yet stored
     _callback: BaseCallback | None
     #: where a loaded checkpoint left the worlds, until ``learn()`` puts them back
@@ -96,19 +105,23 @@ class TwoWorlds(PolicySnapshots):
     def set_target_env(self, env: GymEnv | str) -> None:
         """Set the target; the next ``learn()`` starts a new episode there.
 
-        In the place of another target it begins with an empty D_target, and with no best policy.
+        In the place of another target it begins with an empty D_target, no best policy, and a closed loop that has seen
+        nothing.
 
         :param env: an environment, a VecEnv or an id
-        :raises ValueError: when it is the source itself, has other spaces, or cannot be reset with a seed
+        :raises ValueError: when it is the source itself, has other spaces, cannot be reset with a seed, or is another
+            machine (joints, length of a step) than the simulator that is fitted to it
         """
         if isinstance(env, str):
             env = gym.make(env)
         check_seedable(env, "target_env")
         venv = self._wrap_env(env, self.verbose)
         if self.env is not None:
-            check_pair(self.env, venv)
+            self._check_pair(self.env, venv)
         if self.target_env is not None:  # what the last target told holds for it alone
             self.forget_best()
+            if self.loop is not None:
+                self.loop.forget_target()
             if self.replay_buffer.target.size() > 0:
                 warnings.warn(
                     f"D_target loses {self.replay_buffer.target.size()} transitions of the target before; to go on in "
@@ -119,9 +132,30 @@ class TwoWorlds(PolicySnapshots):
         self._bind_rules(venv, of_target=True)
         self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
         self._offline = self._traces_log = False
+        self._judged_target = False
         self._last_obs = None
         if self.seed is not None:
             self.target_env.seed(self.seed + TARGET_SEED_OFFSET)
+
+    def _check_pair(self, source: VecEnv, target: VecEnv) -> None:
+        """Refuse a target that cannot be the source's, or not that of the simulator that is fitted to it."""
+        check_pair(source, target)
+        if self.dynamics_config is not None and is_mujoco(self.dynamics_config):
+            check_machine(source, target)
+
+    def _doubt_the_target(self, error: float) -> None:
+        """Warn, after the first fit (with the loop closed: after the first trace), where the simulator does not fit."""
+        assert self.dynamics is not None
+        if self._judged_target or (self.loop is not None and not self.loop.found):
+            return
+        self._judged_target = True
+        found = doubts(self.dynamics, error)
+        if found:
+            warnings.warn(
+                f"after the fit {' and '.join(found)}: do the target's observations hold the model's joints in its "
+                "order and units? If so, wider bounds, further declared numbers or close_loop=True may account for it",
+                stacklevel=2,
+            )
 
     def _adopt_target_rules(self) -> None:
         """Hopper's healthy heights follow its body, say: phi_0 knew the source's rules, phi shall know the target's.
@@ -161,7 +195,7 @@ class TwoWorlds(PolicySnapshots):
         self._last_obs = last_obs  # SB3 forgets the observation of what it takes to be the training env
         self._source_world = None
         if self.env is not None and self.target_env is not None:
-            check_pair(self.env, find_ledger(self.target_env))
+            self._check_pair(self.env, find_ledger(self.target_env).venv)
             self.target_env = share_normalisation(find_ledger(self.target_env), self.env)
 
     def get_vec_normalize_env(self) -> VecNormalize | None:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.source import EpisodeSource
@@ -15,7 +16,9 @@ from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Declared
 from sb3_rpto.envs.observations import single_env
+from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.tracing.report import Traced
 
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.transfer import TransferAlgorithm
@@ -35,6 +38,8 @@ FILL = 1_000
 ROUND, PATIENCE, FRESH = 20_000, 2, 100_000
 #: Another simulator made D_source where the present one errs by so much on the oldest so many of its transitions.
 OTHER, OLDEST = 0.02, 500
+#: Width of a normal distribution's 95 % interval, in standard deviations.
+WIDTH = 3.92
 #: A corrected simulator must stay finite for so many steps from states of the target, as the uncorrected one does.
 TRIAL_STATES, TRIAL_STEPS = 16, 20
 
@@ -58,6 +63,10 @@ class LoopCloser:
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "reports": []}
+
+    def forget_target(self) -> None:
+        """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""
+        self._traced_at, self._error = 0, math.inf
 
     def due(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
         """Whether enough was seen for a first trace, or what is new is no longer predicted."""
@@ -88,8 +97,9 @@ class LoopCloser:
     def close_on_log(self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements) -> None:
         """Trace on a robot's log itself, by multiple shooting: one-step errors of noisy samples tell next to nothing.
 
-        phi takes all that is found, as long as the simulator with it is stable; D_target is read anew, as the corrected
-        environment shows it. What the uncorrected source produced is :attr:`stale` from then on.
+        phi takes all that is found, as long as the simulator with it is stable, and where the verdict is
+        ``unexplained`` errs less on the log; D_target is read anew, as the corrected environment shows it. What the
+        uncorrected source produced is :attr:`stale` from then on.
         """
         data = model.transitions("target")
         before = dynamics.error(data)
@@ -132,15 +142,19 @@ class LoopCloser:
     ) -> list[str]:
         """Let phi have the effects that were found, if that pays; the labels of those that are new.
 
-        :param before: error of ``data`` without them; infinite: no matter
+        :param before: error of ``data`` without them; infinite: the report judges
         """
         known = {effect.label for effect in dynamics.effects()}
-        found = [traced.effect for traced in (*report.declared, *report.effects)]
+        all_traced = (*report.declared, *report.effects)
+        found = [traced.effect for traced in all_traced]
         new = [effect.label for effect in found if effect.label not in known and not isinstance(effect, Declared)]
-        kept = dynamics.effects()
-        dynamics.adopt(found)
-        if not stays_finite(dynamics, data):
-            dynamics.replace(kept)
+        if before == math.inf and new and not explains_more(report):
+            return []
+        kept = dynamics.effects(), dynamics.deviations()
+        dynamics.adopt(found, {traced.label: deviation_of(traced) for traced in all_traced})
+        assert model.env is not None
+        if not stays_finite(dynamics, data, model.env):
+            dynamics.replace(*kept)
             warnings.warn(
                 f"the simulator with {', '.join(new) or 'the traced values'} becomes unstable: refused, the last one "
                 "is kept; give bounds to what you declare",
@@ -148,7 +162,7 @@ class LoopCloser:
             )
             return []
         if before < math.inf and not dynamics.error(data) < (WORTH if new else 1.0) * before:
-            dynamics.replace(kept)
+            dynamics.replace(*kept)
             return []
         assert model.dynamics_config is not None
         model.dynamics_config["effects"] = dynamics.added()  # what a checkpoint rebuilds the model from
@@ -164,20 +178,55 @@ def _say(model: TransferAlgorithm, report: Report, added: list[str], data: str, 
     logger.record("gap/adequacy_after", report.adequacy_after.ratio)
     logger.record("gap/verdict", report.verdict)
     logger.record("gap/effects", ", ".join(added) or "none", exclude="tensorboard")
+    model.dump_logs()  # SB3 waits for the end of some episodes, before which a short run is over
     if model.verbose:
         print(f"traced on {data}: {report.verdict}; {', '.join(added) or 'nothing'} added")
+    if report.verdict == "unexplained":
+        warnings.warn(
+            f"the trace on {data} is 'unexplained': what it looked for does not account for the difference, and the "
+            "policy learns in a simulator that still errs; see print(model.loop.reports[-1]) for which joints, and "
+            "whether the observations hold the model's joints in its order, what else could be declared, and "
+            "dynamics='residual'",
+            stacklevel=3,
+        )
 
 
-def stays_finite(dynamics: PhysicalDynamics, data: Transitions) -> bool:
+def deviation_of(traced: Traced) -> np.ndarray:
+    """Standard deviation of the parameters that its interval is worth, (p,); infinite where the interval is unknown."""
+    low, high = traced.interval
+    return np.nan_to_num((high - low) / WIDTH, nan=np.inf)
+
+
+def explains_more(report: Report) -> bool:
+    """Whether the effects are good for anything: explained, or a smaller error of the windows than without them."""
+    return report.verdict != "unexplained" or report.adequacy_after.ratio < report.adequacy_before.ratio
+
+
+def stays_finite(dynamics: PhysicalDynamics, data: Transitions, env: VecEnv) -> bool:
     """Whether the simulator runs on from states of the target under the target's own actions.
 
+    Where there are none, from states that the source resets to, under random actions.
+
     :param data: transitions of the target, oldest first
+    :param env: the source
     """
     if not len(data):
-        return True
+        return dynamics.runs(*_from_resets(env))
     count = max(1, len(data) - TRIAL_STEPS)
     first = np.unique(np.linspace(0, count - 1, TRIAL_STATES).astype(int))
-    return dynamics.runs(data, first, min(TRIAL_STEPS, len(data)))
+    rows = np.minimum(first[:, None] + np.arange(min(TRIAL_STEPS, len(data))), len(data) - 1)
+    observations, actions = data.observations.cpu().numpy(), data.actions.cpu().numpy()
+    return dynamics.runs(observations[first], actions[rows])
+
+
+def _from_resets(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
+    """Observations (n, observation_dim) of a copy's resets, and random actions (n, length, action_dim)."""
+    copy = copy_env(single_env(env))
+    assert copy is not None  # what simulates phi is a copy, too
+    observations = np.array([copy.reset(seed=i)[0] for i in range(TRIAL_STATES)])
+    copy.action_space.seed(0)
+    actions = [[copy.action_space.sample() for _ in range(TRIAL_STEPS)] for _ in range(TRIAL_STATES)]
+    return observations, np.array(actions)
 
 
 def outdated(model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:

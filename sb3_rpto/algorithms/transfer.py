@@ -170,7 +170,7 @@ class TransferAlgorithm(Resumable):
         self.preset = preset
         self.dynamics_backend = dynamics
         self.dynamics_kwargs = dict(dynamics_kwargs or {})
-        self.declared = tuple(declared)
+        self.declared = arguments.list_of_names(declared)
         self.close_loop = close_loop
         #: traces what the simulator lacks, and holds the reports; None with the loop open and no log to trace on
         self.loop = None if not close_loop else LoopCloser(self.declared, None if close_loop is True else close_loop)

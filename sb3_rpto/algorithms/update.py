@@ -150,7 +150,9 @@ class RelativeUpdate(SAC):
         self._close_the_loop()
         for name, value in self.dynamics.describe().items():
             self.logger.record(f"dynamics/{name}", value)
-        self.logger.record("dynamics/error", self.dynamics.error(data))
+        error = self.dynamics.error(data)
+        self.logger.record("dynamics/error", error)
+        self._doubt_the_target(error)
 
     def fit_weights(self, data: Transitions) -> th.Tensor | None:
         """RTO's weight of each transition, (n,); None weighs all alike."""
@@ -172,6 +174,9 @@ class RelativeUpdate(SAC):
 
     def _close_the_loop(self) -> None:
         """After a fit: trace what the simulator lacks, where that was asked for and is due."""
+
+    def _doubt_the_target(self, error: float) -> None:
+        """After a fit that left this one-step error: say once what speaks against the target."""
 
     def sample_batches(self, count: int, batch_size: int) -> Iterator[tuple[ReplayBufferSamples, ReplayBufferSamples]]:
         """For each of ``count`` updates a batch for the critic, mostly of D_source, and one for the actor.

@@ -10,6 +10,7 @@ import torch as th
 from scipy.optimize import lsq_linear
 
 from sb3_rpto.dynamics.base import Transitions, predecessors
+from sb3_rpto.dynamics.identifiable import entangled, null_directions, to_hold
 from sb3_rpto.effects import Effect, Simulation
 from sb3_rpto.effects.sensors import ago, carry_on
 from sb3_rpto.effects.simulation import Drive
@@ -179,6 +180,9 @@ class OneStep:
         self.clip = 1.0
         #: parameters that the transitions did not show at the last step, (p,)
         self.unseen = np.zeros(len(scale), dtype=bool)
+        #: parameters that the transitions show, but do not tell apart, and those of them that stay, (p,)
+        self.entangled = np.zeros(len(scale), dtype=bool)
+        self.held = np.zeros(len(scale), dtype=bool)
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
         """Errors of ``k`` phis (k, p) in standard one-step changes, (k, n, c)."""
@@ -194,13 +198,24 @@ class OneStep:
     def linearise(self, values: np.ndarray, difference: float) -> tuple[np.ndarray, np.ndarray]:
         """Residuals at one phi (p,), (n, c), and their derivative by phi in scales, (n, c, p).
 
-        :param difference: of the parameters, in scales
+        :param difference: of the parameters, in scales; negative: downwards
         """
         change = difference * self.scale
-        change = np.where(values + change > self.upper, -change, change)
+        beyond = (values + change > self.upper) | (values + change < self.lower)
+        change = np.where(beyond, -change, change)
         found = self.residuals(np.concatenate([values[None], values + np.diag(change)]))
         slopes = (found[1:] - found[0]) * (self.scale / change)[:, None, None]
         return found[0], slopes.transpose(1, 2, 0)
+
+    def hold_what_is_not_determined(self, values: np.ndarray) -> None:
+        """Let one parameter stay for each direction of phi, at ``values`` (p,), that no residual shows."""
+        narrow = DIFFERENCES[-1]
+        (residual, up), (_, down) = self.linearise(values, narrow), self.linearise(values, -narrow)
+        self.clip = _clip(residual)
+        # One-sided differences of products such as gear x gain would leave a trace of the direction.
+        a, b = self._weighted(residual, (up + down) / 2)
+        directions = null_directions(a, _shown(a, b))
+        self.entangled, self.held = entangled(directions), to_hold(directions)
 
     def step(self, values: np.ndarray, max_step: float) -> np.ndarray | None:
         """A Gauss-Newton step that lowers the cost, within the bounds and a trusted size; None where there is none.
@@ -222,12 +237,11 @@ class OneStep:
 
     def _within(self, values: np.ndarray, residual: np.ndarray, slopes: np.ndarray, reach: float) -> np.ndarray:
         """The weighted least-squares step in the bounds and within a reach as :meth:`step` says."""
-        root = np.sqrt(self.robust(residual))
-        a, b = (root[:, :, None] * slopes).reshape(-1, len(values)), -(root * residual).reshape(-1)
-        size = np.sqrt((a**2).sum(axis=0))
-        shown = size >= UNSEEN * max(float(np.sqrt((b**2).sum())), 1e-6)
+        a, b = self._weighted(residual, slopes)
+        shown = _shown(a, b)
         self.unseen &= ~shown
-        free = np.flatnonzero(shown)
+        free = np.flatnonzero(shown & ~self.held)
+        size = np.sqrt((a**2).sum(axis=0))
         moved = values.copy()
         if len(free):
             # Directions that the data hardly tell apart share a move.
@@ -240,19 +254,36 @@ class OneStep:
             moved[free] += lsq_linear(a, b, box, method="bvls").x * self.scale[free]
         return np.clip(moved, self.lower, self.upper)
 
+    def _weighted(self, residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The least squares ``a x = b`` of a step x in scales: (n c, p) and (n c,)."""
+        root = np.sqrt(self.robust(residual))
+        return (root[:, :, None] * slopes).reshape(-1, slopes.shape[2]), -(root * residual).reshape(-1)
+
     def robust(self, residual: np.ndarray) -> np.ndarray:
         """Weights of the residuals (n, c) in the least squares that stand for the robust loss."""
         return np.asarray(self.share[:, None] / np.sqrt(1 + (residual / self.clip) ** 2))
 
     def deviation(self, values: np.ndarray) -> np.ndarray:
-        """Standard deviation of phi by the sandwich estimate, each transition an observation, (p,); 0 where unseen."""
+        """Standard deviation of phi by the sandwich estimate, each transition an observation, (p,).
+
+        Infinite for what the transitions do not show or tell apart.
+        """
         residual, slopes = self.linearise(values, DIFFERENCES[1])
         robust = self.robust(residual)
         hessian = np.einsum("nc,ncp,ncq->pq", robust, slopes, slopes)
         scores = np.einsum("nc,ncp,nc->np", robust, slopes, residual)
-        inverse = np.linalg.pinv(hessian, rcond=1e-10, hermitian=True)
-        spread = np.sqrt(np.maximum(np.diag(inverse @ (scores.T @ scores) @ inverse), 0.0)) * self.scale
-        return np.where(self.unseen, 0.0, spread)
+        free = np.flatnonzero((np.diag(hessian) > 0) & ~self.held)
+        inverse = np.linalg.pinv(hessian[np.ix_(free, free)], rcond=1e-10, hermitian=True)
+        scores = scores[:, free]
+        spread = np.full(len(values), np.inf)
+        spread[free] = np.sqrt(np.maximum(np.diag(inverse @ (scores.T @ scores) @ inverse), 0.0)) * self.scale[free]
+        return np.where(self.unseen | self.entangled, np.inf, spread)
+
+
+def _shown(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Which parameters move the residuals ``b`` (m,) at all, by the derivatives ``a`` (m, p); (p,)."""
+    size = np.sqrt((a**2).sum(axis=0))
+    return np.asarray(size >= UNSEEN * max(float(np.sqrt((b**2).sum())), 1e-6))
 
 
 def _clip(residual: np.ndarray) -> float:

@@ -89,6 +89,8 @@ class PhysicalDynamics(Dynamics):
     parameters' bounds and within a trusted size, so that the source moves smoothly towards the target; a step that
     would raise the error is shortened. Derivatives are finite differences, all columns and transitions in one
     :class:`mujoco.batch.Batch`. Parameters that the data do not show stay where they are, and are named in a warning.
+    Of those that the data show only together, such as a motor's gear and gain, the ones declared last stay, as many as
+    it takes for the others to be determined; they are named, too.
 
     The source world is the environment itself with phi in it (:meth:`effects`), so rewards, terminations and resets are
     the environment's own.
@@ -146,11 +148,12 @@ class PhysicalDynamics(Dynamics):
         self.threads = threads
         self._twin: CorrectedEnv | None = None
         self._unseen: tuple[str, ...] = ()
+        self._entangled: tuple[str, ...] = ()
         known: list[Effect] = [*declare(model, declared)]
         self._adopt([*known, *map(from_json, effects)])
 
-    def _adopt(self, effects: Sequence[Effect]) -> None:
-        """Let phi be the values of these effects."""
+    def _adopt(self, effects: Sequence[Effect], deviations: Mapping[str, np.ndarray] | None = None) -> None:
+        """Let phi be the values of these effects, with deviations by their labels, 0 where none is told."""
         self.simulation = Simulation(self.model, effects, self.threads)
         gears = np.abs(self.model.actuator_gear[:, 0]) * np.max(
             np.abs(self.model.actuator_ctrlrange), axis=1, initial=0
@@ -164,7 +167,9 @@ class PhysicalDynamics(Dynamics):
         self._scale = np.maximum(np.abs(self.simulation.null), sizes)
         device = self._values.device if "_values" in self._buffers else None
         self.register_buffer("_values", th.as_tensor(values, dtype=th.float64, device=device))
-        self.register_buffer("_deviation", th.zeros(len(values), dtype=th.float64, device=device))
+        told = [(deviations or {}).get(e.label, np.zeros(len(e.parameters))) for e in self.simulation.effects]
+        deviation = np.concatenate([*told, np.zeros(0)])
+        self.register_buffer("_deviation", th.as_tensor(deviation, dtype=th.float64, device=device))
 
     # ------------------------------------------------------------------ phi
 
@@ -175,48 +180,56 @@ class PhysicalDynamics(Dynamics):
 
     @property
     def deviation(self) -> np.ndarray:
-        """Standard deviation of phi in its units, (p,): of the last fit, robust against correlated errors; 0 before."""
+        """Standard deviation of phi in its units, (p,): of the last fit (robust against correlated errors) or trace.
+
+        0 before; infinite for a parameter that the data did not determine.
+        """
         return self._deviation.cpu().numpy()
 
     def effects(self, generator: np.random.Generator | None = None) -> list[Effect]:
         """Declared numbers and effects with the values of phi, for :class:`~sb3_rpto.effects.CorrectedEnv`.
 
-        :param generator: draws phi from its uncertainty, ``randomise`` times as wide; None: the estimate
+        :param generator: draws phi from its uncertainty, ``randomise`` times as wide, but for parameters that the data
+            did not determine; None: the estimate
         """
         values = self.values
         if generator is not None and self.randomise > 0:
-            values = values + self.randomise * self.deviation * generator.standard_normal(len(values))
+            known = np.where(np.isfinite(self.deviation), self.deviation, 0.0)  # nothing tells how far else to go
+            values = values + self.randomise * known * generator.standard_normal(len(values))
             values = np.clip(values, self._lower, self._upper)
         return [e.with_values(values[s]) for e, s in zip(self.simulation.effects, self.simulation.slices)]
 
-    def adopt(self, found: Sequence[Effect]) -> None:
+    def deviations(self) -> dict[str, np.ndarray]:
+        """:attr:`deviation` by the labels of the effects, each (number of its parameters,)."""
+        return {e.label: self.deviation[s] for e, s in zip(self.simulation.effects, self.simulation.slices)}
+
+    def adopt(self, found: Sequence[Effect], deviations: Mapping[str, np.ndarray] | None = None) -> None:
         """Take effects that were traced into phi, and the values that declared numbers had beside them.
 
         :param found: declared numbers by the names that were declared, and further effects
+        :param deviations: standard deviations of their parameters by their labels; 0 for those that are not told
         """
-        mine = {e.label: e for e in self.effects()}
+        mine, known = {e.label: e for e in self.effects()}, self.deviations()
         for effect in found:
             old = mine.get(effect.label)
             mine[effect.label] = effect if old is None else old.with_values(effect.values)
-        self._adopt(list(mine.values()))
+            known[effect.label] = np.zeros(len(effect.parameters))
+        self._adopt(list(mine.values()), {**known, **(deviations or {})})
 
-    def replace(self, effects: Sequence[Effect]) -> None:
-        """Let phi be exactly these effects with their values, as :meth:`effects` gave them."""
-        self._adopt(list(effects))
+    def replace(self, effects: Sequence[Effect], deviations: Mapping[str, np.ndarray]) -> None:
+        """Let phi be exactly these, as :meth:`effects` and :meth:`deviations` gave them."""
+        self._adopt(list(effects), deviations)
 
-    def runs(self, data: Transitions, first: np.ndarray, length: int) -> bool:
-        """Whether simulations from some of the target's states under its actions stay finite.
+    def runs(self, observations: np.ndarray, actions: np.ndarray) -> bool:
+        """Whether simulations from some states under some actions stay finite.
 
-        :param data: transitions, oldest first
-        :param first: rows to start from
-        :param length: transitions to run on for
+        :param observations: of the states, (n, observation_dim)
+        :param actions: of the transitions from there on, (n, length, nu)
         """
-        states = self.recover(data.observations.cpu().numpy().astype(np.float64)[first])
-        actions = data.actions.cpu().numpy().astype(np.float64)
-        rows = np.minimum(first[:, None] + np.arange(length), len(actions) - 1)
-        commands = np.repeat(np.clip(actions[rows], *self._limits()), self.frame_skip, axis=1)
+        states = self.recover(observations.astype(np.float64))
+        commands = np.repeat(np.clip(actions.astype(np.float64), *self._limits()), self.frame_skip, axis=1)
         qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
-        values = np.tile(self.values, (len(first), 1))
+        values = np.tile(self.values, (len(observations), 1))
         true_state(self.simulation, values, qpos, qvel)
         q, v = self.simulation.rollout(values, qpos, qvel, Drive(commands))
         return bool(np.isfinite(q).all() and np.isfinite(v).all())
@@ -226,6 +239,16 @@ class PhysicalDynamics(Dynamics):
         limited = self.model.actuator_ctrllimited.astype(bool)
         low, high = np.where(limited[:, None], self.model.actuator_ctrlrange, (-np.inf, np.inf)).T
         return low, high
+
+    def declared_at_bounds(self) -> list[str]:
+        """Names and values of declared numbers that have moved to a bound."""
+        declared = np.array(
+            [isinstance(e, Declared) for e in self.simulation.effects for _ in e.parameters], dtype=bool
+        )
+        values = self.values
+        there = (values <= self._lower) | (values >= self._upper)
+        moved = declared & there & (values != self.simulation.null)
+        return [f"{self.names[i]} = {values[i]:.4g}" for i in np.flatnonzero(moved)]
 
     def added(self) -> list[dict[str, Any]]:
         """The effects beside the declared numbers, as ``effects=`` takes them."""
@@ -318,6 +341,7 @@ class PhysicalDynamics(Dynamics):
             return {"steps": 0.0, "left_out": left_out}
         values, taken = self.values.copy(), 0
         problem = OneStep(self.simulation, self._scale, self._lower, self._upper, steps, weights)
+        problem.hold_what_is_not_determined(values)
         for _ in range(self.max_steps if max_steps is None else max_steps):
             moved = problem.step(values, self.max_step)
             if moved is None:
@@ -329,6 +353,7 @@ class PhysicalDynamics(Dynamics):
         self._values.copy_(th.as_tensor(values))
         self._deviation.copy_(th.as_tensor(problem.deviation(values)))
         self._name_unseen(problem.unseen)
+        self._name_entangled(problem.entangled, problem.held)
         return {"steps": float(taken), "left_out": left_out}
 
     def _name_unseen(self, unseen: np.ndarray) -> None:
@@ -341,6 +366,17 @@ class PhysicalDynamics(Dynamics):
                 stacklevel=3,
             )
         self._unseen = names
+
+    def _name_entangled(self, entangled: np.ndarray, held: np.ndarray) -> None:
+        """Warn once of parameters that the data do not tell apart."""
+        names, stay = (tuple(self.names[i] for i in np.flatnonzero(which)) for which in (entangled, held))
+        if set(names) - set(self._entangled):
+            warnings.warn(
+                f"the target's data do not tell {', '.join(names)} apart: {', '.join(stay)} left at what it was, the "
+                "rest is fitted to that and has no standard error; declare fewer of them, or add what is known of one",
+                stacklevel=3,
+            )
+        self._entangled = names
 
 
 def _name(effect: Effect, parameter: str) -> str:

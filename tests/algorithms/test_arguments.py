@@ -119,3 +119,9 @@ def test_a_batch_keeps_a_row_of_the_source():
     assert model._n_updates == 100
     batches = list(model.critic_batches(5, 32))
     assert [len(b.rewards) for b in batches] == [32] * 5
+
+
+def test_a_single_declared_name_does_not_come_apart_into_letters():
+    env, target = (gym.make("InvertedDoublePendulum-v5") for _ in range(2))
+    with pytest.raises(TypeError, match=r"list of names, not the string 'pole.length'; write \['pole.length'\]"):
+        small(RPTO, env, target, dynamics="physical", dynamics_kwargs={}, declared="pole.length")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 from collections import deque
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPTO
 from sb3_rpto.algorithms import closing
@@ -19,7 +22,7 @@ from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.tracing import Report
+from sb3_rpto.tracing import Report, trace
 
 TASK = "InvertedDoublePendulum-v5"
 KINDS = ["coulomb_friction", "torque_offset", "quadratic_drag"]
@@ -75,6 +78,27 @@ def test_an_undeclared_effect_is_named_added_and_fitted() -> None:
     values = dynamics(made).describe()
     assert values["coulomb_friction(slider).level"] == pytest.approx(LEVEL, rel=0.01)
     assert values["pole.length"] == pytest.approx(LENGTH * 0.6, rel=0.01)
+
+
+def test_a_trace_is_logged_before_any_episode_ends(soon: None, tmp_path: Path) -> None:
+    made = filled([])
+    made.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))
+    assert made.loop is not None
+    made.loop.close(made, dynamics(made))
+    (line,) = csv.DictReader((tmp_path / "progress.csv").open())
+    assert line["gap/verdict"] == "complete"
+    assert line["gap/effects"] == "none"
+    assert float(line["gap/residual_after"]) < 1e-3 < float(line["gap/residual_before"])
+
+
+def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = filled([])
+    monkeypatch.setattr(
+        closing, "trace", lambda *args, **kwargs: replace(trace(*args, **kwargs), verdict="unexplained")
+    )
+    assert made.loop is not None
+    with pytest.warns(UserWarning, match=r"on 101 target transitions is 'unexplained'.*reports\[-1\].*in its order"):
+        made.loop.close(made, dynamics(made))
 
 
 def test_no_target_step_is_spent_on_tracing() -> None:
@@ -166,13 +190,15 @@ def test_an_unstable_correction_is_refused(soon: None, monkeypatch: pytest.Monke
     assert dynamics(made).describe() == before
 
 
-def test_instability_is_seen() -> None:
+@pytest.mark.parametrize("seen", [30, 0])
+def test_instability_is_seen(seen: int) -> None:
     made = filled([], 30)
-    data = made.transitions("target")
-    assert stays_finite(dynamics(made), data)
+    assert made.env is not None
+    data = made.transitions("target").take(slice(0, seen))
+    assert stays_finite(dynamics(made), data, made.env)
     spring = LIBRARY["spring"]("hinge", stiffness=1e9)
     dynamics(made).adopt([spring])
-    assert not stays_finite(dynamics(made), data)
+    assert not stays_finite(dynamics(made), data, made.env)
 
 
 def test_another_trace_is_due_when_new_transitions_are_no_longer_predicted(
@@ -189,6 +215,19 @@ def test_another_trace_is_due_when_new_transitions_are_no_longer_predicted(
     assert not loop.due(made, dynamics(made))
     append(made, [LIBRARY["torque_offset"]("hinge", offset=2.0)], 30)
     assert loop.due(made, dynamics(made))
+
+
+def test_a_new_target_is_traced_anew(soon: None) -> None:
+    made = filled(friction())
+    assert made.loop is not None
+    made.loop.close(made, dynamics(made))
+    lacks: list[Effect] = [LIBRARY["torque_offset"]("hinge", offset=2.0)]
+    with pytest.warns(UserWarning, match="D_target loses 101"):
+        made.set_target_env(target(lacks))
+    append(made, lacks, 70)
+    assert not made.loop.due(made, dynamics(made))
+    append(made, lacks, 10)  # as many as a first trace takes
+    assert made.loop.due(made, dynamics(made))
 
 
 @pytest.mark.parametrize(

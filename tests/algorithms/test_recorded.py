@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 from dataclasses import replace
 from functools import cache
@@ -240,6 +241,33 @@ def test_what_the_log_shows_joins_phi() -> None:
     assert values["torque_offset(slider).offset"] == pytest.approx(OFFSET, rel=0.03)
     assert values["hinge.damping"] == pytest.approx(DAMPING, rel=0.1)
     assert "torque_offset(slider)" in [effect.label for effect in made._source_world.copies[0].effects]
+
+
+def test_what_the_trace_left_open_is_what_episodes_differ_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = learned()
+    traced = (*made.loop.reports[0].declared, *made.loop.reports[0].effects)
+    widths = np.concatenate([np.diff(t.interval, axis=0)[0] for t in traced])
+    assert (widths > 0).all()
+    np.testing.assert_allclose(made.dynamics.deviation, widths / 3.92)
+    monkeypatch.setattr(made.dynamics, "randomise", 2.0)
+    rng = np.random.default_rng(0)
+    drawn = np.array([np.concatenate([e.values for e in made.dynamics.effects(rng)]) for _ in range(200)])
+    np.testing.assert_allclose(drawn.std(axis=0), 2 * made.dynamics.deviation, rtol=0.2)
+
+
+@pytest.mark.parametrize(("ratio", "joins"), [(0.9, True), (1.0, False), (1.2, False)])
+def test_what_does_not_explain_a_log_joins_phi_where_it_helps_at_all(
+    ratio: float, joins: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = learned().loop.reports[0]
+    after = dataclasses.replace(report.adequacy_before, ratio=ratio * report.adequacy_before.ratio)
+    unexplained = dataclasses.replace(report, verdict="unexplained", adequacy_after=after)
+    monkeypatch.setattr(closing, "trace", lambda *_, **__: unexplained)
+    made = model(log(pushed=True), RTO, close_loop=["torque_offset"])
+    with pytest.warns(UserWarning, match="the trace on 5 recorded episodes is 'unexplained'"):
+        made.learn(40, source_timesteps=0)
+    assert ("torque_offset(slider).offset" in made.dynamics.names) == joins
+    assert (made.dynamics.values[0] == pytest.approx(DAMPING, rel=0.1)) == joins
 
 
 def test_source_steps_are_counted_and_old_ones_dropped() -> None:

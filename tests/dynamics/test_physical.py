@@ -231,11 +231,55 @@ def test_what_the_data_do_not_show_is_named_once_and_stays(pole):
         model.fit(pole, max_steps=20)
     assert caught[0].filename == __file__
     assert model.values[1] == nominal[1]
-    assert model.deviation[1] == 0
-    assert model.deviation[0] > 0
+    assert model.deviation[1] == np.inf
+    assert 0 < model.deviation[0] < np.inf
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model.fit(pole)
+
+
+@pytest.mark.parametrize("level", [0, 1e-3])
+def test_what_the_data_do_not_tell_apart_is_named_once_and_one_of_it_stays(level):
+    data = noisy(collect(shifted(POLE, {"slide.gear": 130.0, "pole.mass": 7.0}), 100), level)
+    model = dynamics(POLE, ["slide.gear", "pole.mass=4:9", "slide.gain"])
+    said = r"do not tell slide\.gear, slide\.gain apart: slide\.gain left at"
+    with pytest.warns(UserWarning, match=said) as caught:
+        model.fit(data, max_steps=20)
+    assert caught[0].filename == __file__
+    np.testing.assert_allclose(model.values, [130.0, 7.0, 1.0], rtol=0.01)
+    assert model.values[2] == 1.0
+    np.testing.assert_array_equal(model.deviation[[0, 2]], np.inf)
+    assert model.deviation[1] < 0.1
+    model.randomise = 2.0
+    drawn = [e.values[0] for e in model.effects(np.random.default_rng(0))]
+    assert [drawn[0], drawn[2]] == [model.values[0], model.values[2]]
+    before = model.values
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.fit(data)
+    assert model.values[2] == 1.0
+    np.testing.assert_allclose(model.values, before, rtol=1e-3)
+
+
+def test_all_that_a_direction_has_in_common_is_named_and_one_of_it_stays():
+    names = ["cart.mass", "pole.mass", "slide.gear", "slider.damping", "hinge.damping"]  # twice all is the same motion
+    data = collect(shifted(POLE, {"slide.gear": 130.0}), 100)
+    model = dynamics(POLE, names)
+    with pytest.warns(UserWarning, match=rf"tell {', '.join(names)} apart: hinge.damping left"):
+        model.fit(data, max_steps=20)
+    assert model.error(data) < 1e-6
+    assert model.describe()["slide.gear"] == pytest.approx(130.0, rel=1e-3)
+
+
+def test_numbers_that_are_hard_to_tell_apart_are_all_fitted():
+    names = ["*.mass", "slide.gear"]
+    data = collect(shifted(POLES, {"slide.gear": 600.0}), 100)
+    model = dynamics(POLES, names)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.fit(data, max_steps=40)
+    assert model.describe()["slide.gear"] == pytest.approx(600.0, rel=0.01)
+    assert np.isfinite(model.deviation).all()
 
 
 def test_the_deviation_shrinks_with_the_data():
@@ -286,7 +330,8 @@ def test_a_trial_run_begins_at_the_true_state_not_at_what_a_biased_sensor_shows(
     model.adopt([SensorBias("hinge", offset=0.05)])
     begun, rollout = [], model.simulation.rollout
     monkeypatch.setattr(model.simulation, "rollout", lambda *a: begun.append(a[1].copy()) or rollout(*a))
-    assert model.runs(data, np.array([3, 7]), 5)
+    actions = data.actions.numpy()
+    assert model.runs(data.observations.numpy()[[3, 7]], np.stack([actions[3:8], actions[7:12]]))
     shown = data.observations[[3, 7], 1].numpy()  # the hinge's angle
     np.testing.assert_allclose(begun[0][:, 1], shown - 0.05, atol=1e-6)
 
@@ -305,6 +350,19 @@ def test_adopt_keeps_the_values_of_what_it_is_not_told():
         *("pole.mass", "hinge.damping", "command_delay(slide)", "stribeck_friction(hinge)")
     ]
     np.testing.assert_array_equal(model.deviation, np.zeros(6))
+
+
+def test_adopt_takes_deviations_and_keeps_those_of_what_it_is_not_told(pole):
+    model = dynamics(POLE)
+    model.fit(noisy(pole, 1e-3), max_steps=3)
+    found = CommandDelay("slide", delay=0.03)
+    damping = model.effects()[1]
+    before, known = model.effects(), model.deviations()
+    model.adopt([found, damping], {found.label: np.array([0.002])})
+    np.testing.assert_array_equal(model.deviation, [known["pole.mass"][0], 0, 0.002])
+    model.replace(before, known)
+    assert model.names == list(SHIFTS[POLE])
+    np.testing.assert_array_equal(model.deviation, [*known["pole.mass"], *known["hinge.damping"]])
 
 
 def test_what_was_added_and_the_state_rebuild_the_model(pole):

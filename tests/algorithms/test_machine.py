@@ -1,0 +1,95 @@
+"""A target that is not the machine of the simulator: refused where it shows its model, doubted where it does not."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers import FlattenObservation, TimeLimit
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_rpto import RPTO
+from sb3_rpto.algorithms.machine import LARGE, check_machine
+from sb3_rpto.effects import declare
+from sb3_rpto.envs.corrected import apply_effects
+
+POLES = "InvertedDoublePendulum-v5"
+#: hinge and hinge2 (their sines, cosines and speeds) change places
+SWAPPED = [0, 2, 1, 4, 3, 5, 7, 6, 8]
+
+
+class Swapped(gym.Wrapper):
+    """The second pole in the place of the first."""
+
+    def reset(self, **kwargs):
+        observation, info = self.env.reset(**kwargs)
+        return observation[SWAPPED], info
+
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        return observation[SWAPPED], *rest
+
+
+def shifted(length=0.7):
+    source = gym.make(POLES)
+    (number,) = declare(source.unwrapped.model, ["pole.length"])
+    return apply_effects(source, [number.with_values(np.array([length]))])
+
+
+def model(target, declared="pole.length", env=POLES, **kwargs):
+    settings = {"seed": 0, "device": "cpu", "source_steps": 2, "model_train_freq": 40, "batch_size": 16, **kwargs}
+    settings = {"dynamics": "physical", "dynamics_kwargs": {"threads": 1}, **settings}
+    settings |= {} if settings["dynamics"] == "ensemble" else {"declared": [declared]}
+    return RPTO("MlpPolicy", gym.make(env), target_env=target, **settings)
+
+
+def venv(env):
+    return DummyVecEnv([lambda: env])
+
+
+def test_joints_of_another_machine_are_refused():
+    with pytest.raises(ValueError, match="target_env has the joint 'bthigh' where env has the joint 'thigh_joint'"):
+        check_machine(venv(gym.make("Walker2d-v5")), venv(gym.make("HalfCheetah-v5")))
+    with pytest.raises(ValueError, match="has the joint 'hinge2' where env has no further joint"):
+        check_machine(venv(gym.make("InvertedPendulum-v5")), venv(gym.make(POLES)))
+    # Observations and actions of the two have the same shapes.
+    with pytest.raises(ValueError, match="'thigh_joint' where env has the joint 'bthigh': phi"):
+        model(gym.make("Walker2d-v5"), "torso.mass", "HalfCheetah-v5")
+
+
+@pytest.mark.parametrize("dynamics", ["physical", "residual"])
+def test_steps_of_another_length_are_refused(dynamics):
+    with pytest.raises(ValueError, match=r"a step of target_env takes 0.1 s, one of env 0.05 s.*frame_skip"):
+        model(gym.make(POLES, frame_skip=10), dynamics=dynamics)
+
+
+def test_networks_may_learn_any_target():
+    model(gym.make(POLES, frame_skip=10), dynamics="ensemble", dynamics_kwargs={"hidden": (8, 8)})
+
+
+def test_other_numbers_wrappers_and_targets_without_a_model_pass():
+    model(TimeLimit(FlattenObservation(shifted()), 50))
+    check_machine(venv(gym.make(POLES)), venv(gym.make("Pendulum-v1")))
+
+
+def test_joints_in_another_order_are_doubted_once():
+    made = model(Swapped(shifted()))
+    with pytest.warns(UserWarning, match=r"one-step error is still .*model's joints in its order and units\?"):
+        made.learn(45, source_timesteps=0)
+    assert made.dynamics.error(made.transitions("target")) > LARGE
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="after the fit")
+        made.learn(45, reset_num_timesteps=False)
+
+
+def test_a_number_at_its_bound_is_doubted():
+    made = model(shifted(0.7), "pole.length=0.55:0.65")
+    with pytest.warns(UserWarning, match=r"after the fit pole\.length = 0\.65 lies at its bound: do the target's"):
+        made.learn(45, source_timesteps=0)
+
+
+def test_what_fits_is_not_doubted():
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="after the fit")
+        made = model(shifted()).learn(45, source_timesteps=0)
+    assert made._judged_target

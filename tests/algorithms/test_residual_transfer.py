@@ -1,0 +1,54 @@
+"""RPTO over a simulator with a small ensemble on what it misses: learns, corrects, comes back from a checkpoint."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_rpto import RPTO
+from sb3_rpto.dynamics.residual import ResidualDynamics
+from sb3_rpto.effects import LIBRARY
+from sb3_rpto.envs.corrected import apply_effects
+
+TASK = "InvertedPendulum-v5"
+TINY = {"n_members": 2, "n_elites": 2, "hidden": (16, 16), "max_steps": 150}
+
+
+def target():
+    return apply_effects(gym.make(TASK), [LIBRARY["quadratic_drag"]("slider", coefficient=8.0)])
+
+
+@pytest.fixture(scope="module")
+def learned():
+    made = RPTO(
+        *("MlpPolicy", gym.make(TASK)),
+        target_env=target(),
+        dynamics="residual",
+        declared=["pole.mass"],
+        dynamics_kwargs={"threads": 1, "ensemble_kwargs": TINY},
+        **{"seed": 0, "device": "cpu", "gradient_steps": 1, "source_steps": 2, "model_train_freq": 60},
+        **{"batch_size": 16, "policy_kwargs": {"net_arch": [16]}, "buffer_size": 500},
+    )
+    return made.learn(65, source_timesteps=50)
+
+
+def test_it_learns_within_the_budget(learned):
+    assert learned.num_timesteps == learned.target_spent["learning"] == 65
+    assert isinstance(learned.dynamics, ResidualDynamics)
+    assert learned.dynamics.describe()["pole.mass"] != pytest.approx(5.0186, rel=1e-3)  # fitted
+    log = learned.dynamics.fit(learned.transitions("target"))
+    assert log["combined_error"] <= log["physical_error"]
+
+
+def test_it_comes_back_from_a_checkpoint_and_goes_on(learned, tmp_path):
+    learned.save(tmp_path / "model")
+    learned.save_replay_buffer(tmp_path / "buffer")
+    loaded = RPTO.load(tmp_path / "model", env=gym.make(TASK), target_env=target(), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert loaded.dynamics.describe() == learned.dynamics.describe()
+    data = learned.transitions("target")
+    for model in (learned, loaded):
+        model.dynamics.attach(gym.make(TASK))
+    answers = [m.dynamics.step(data.observations, data.actions, deterministic=True) for m in (learned, loaded)]
+    np.testing.assert_array_equal(answers[0].next_observations, answers[1].next_observations)
+    loaded.learn(10, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 75

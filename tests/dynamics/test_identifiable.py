@@ -1,0 +1,32 @@
+"""Null directions: what is found, who belongs to one, and who is held."""
+
+import numpy as np
+import pytest
+
+from sb3_rpto.dynamics.identifiable import entangled, null_directions, to_hold
+
+rng = np.random.default_rng(0)
+A, B, C = rng.standard_normal((3, 40))
+
+
+@pytest.mark.parametrize(
+    ("columns", "shown", "together", "held"),
+    [
+        ([A, B, C], None, [], []),
+        ([A, A, C], None, [0, 1], [1]),
+        ([A, -0.2 * A, C], None, [0, 1], [1]),
+        ([-1e-4 * A, A, C], None, [0], [0]),  # plausible sizes of the weak one hardly change the strong one
+        ([A, C, A, A], None, [0, 2, 3], [2, 3]),
+        ([A, B, A + B, C, 2 * C], None, [0, 1, 2, 3, 4], [2, 4]),
+        ([A, 0 * A, C], None, [], []),  # no direction: nothing is seen of it at all
+        ([A, A, C], [True, False, True], [], []),
+        ([A, A + 1e-2 * B, C], None, [], []),  # hard to tell apart, but told
+        ([A], None, [], []),
+    ],
+)
+def test_directions_are_found(columns, shown, together, held):
+    shown = np.ones(len(columns), dtype=bool) if shown is None else np.array(shown)
+    directions = null_directions(np.stack(columns, axis=1), shown)
+    np.testing.assert_allclose(np.stack(columns, axis=1) @ directions, 0, atol=1e-6)
+    assert np.flatnonzero(entangled(directions)).tolist() == together
+    assert np.flatnonzero(to_hold(directions)).tolist() == held
