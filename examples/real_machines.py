@@ -19,6 +19,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
+from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.machines import MACHINES, Machine, find_measured
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, predictions
@@ -114,6 +115,7 @@ def main() -> None:
             writer.writerows(errors)
         manifest = {
             "command": f"python examples/real_machines.py --only {name} --seed {arguments.seed}",
+            "commit": provenance.commit(),
             "versions": {p: version(p) for p in ("sb3-rpto", "mujoco", "numpy", "scipy")},
             "python": platform.python_version(),
             "licence": MACHINES[name](folder).licence,

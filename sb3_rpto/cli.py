@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: Exit codes: bad input, and interrupted by the user.
 BAD_INPUT, INTERRUPTED = 2, 130
-#: What users can cause. Anything else is an error of ours and keeps its traceback.
+#: What users can cause is said in one line; an error of ours keeps its traceback, unless it is of these kinds, too.
 USER_ERRORS = (ValueError, TypeError, OSError, ImportError)
 #: Readers of recordings by the suffix of their files.
 FORMATS = {"csv": "from_csv", "parquet": "from_parquet", "npz": "from_npz"}

@@ -200,10 +200,8 @@ def judge(before: Adequacy, after: Adequacy, named: bool) -> str:
     ``partly explained``: they at least halve the excess log error (or, where the typical error is no more than noise,
     the share of windows that are). ``unexplained``: they do not.
     """
-    if before.adequate:
-        return "complete"
     if not named:
-        return "unexplained"
+        return "complete" if before.adequate else "unexplained"
     if after.adequate:
         return "explained"
     if before.ratio <= 1 + TOLERANCE:  # only stray windows deny that it is complete

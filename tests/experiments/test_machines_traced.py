@@ -1,10 +1,28 @@
-"""Real recordings, traced with a few candidates; skipped where they are absent."""
+"""Real recordings, traced with a few candidates, and the committed traces; skipped where they are absent."""
 
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
 import pytest
 
+from sb3_rpto.effects import LIBRARY, Simulation, declare
+from sb3_rpto.effects.model import load_model
 from sb3_rpto.experiments.machines import MACHINES, find_measured
-from sb3_rpto.tracing import Report, trace
+from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.tracing.evaluate import horizon_errors
+from sb3_rpto.tracing.windows import discretised, noise_levels
 
+RESULTS = Path(__file__).parents[2] / "examples" / "results" / "machines"
+#: What a first attempt elsewhere reached, in rad: RMSE at 0.5 s on test and other runs, mean error of whole runs.
+FIRST_ATTEMPT = {
+    ("simple_pendulum", "test", "0.5", "rmse"): [0.038],
+    ("double_pendulum", "test", "0.5", "rmse"): [0.021, 0.075],
+    ("double_pendulum", "other", "0.5", "rmse"): [0.043, 0.136],
+    ("servo_xl330", "test", "whole run", "mae"): [0.057],
+}
 FOLDER = find_measured()
 pytestmark = pytest.mark.skipif(FOLDER is None, reason="the recordings are absent; docs/real-machines.md tells of them")
 
@@ -23,3 +41,46 @@ def test_a_real_pendulum_lacks_dry_friction() -> None:
     assert after[0.5] < 0.4 * before[0.5]
     # Its recordings hold more than that: friction is no full explanation.
     assert report.verdict in ("partly explained", "unexplained")
+
+
+def committed(name: str) -> tuple[dict, list[dict[str, str]]]:
+    with (RESULTS / f"{name}.csv").open(newline="", encoding="utf-8") as stream:
+        return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")), list(csv.DictReader(stream))
+
+
+def corrected(found: dict, model) -> Simulation:
+    """The simulation with the values that were committed."""
+    kinds = [(e["label"].rstrip(")").split("("), e["parameters"]) for e in found["effects"]]
+    effects = [LIBRARY[kind](on, **{n: p["value"] for n, p in values.items()}) for (kind, on), values in kinds]
+    declared = declare(model, [e["label"] for e in found["declared"]])
+    values = [e["parameters"][e["label"]]["value"] for e in found["declared"]]
+    return Simulation(model, [*(d.with_values([v]) for d, v in zip(declared, values)), *effects], 1)
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_committed_errors_are_those_of_the_committed_values(name: str) -> None:
+    machine, (found, rows) = MACHINES[name](FOLDER), committed(name)
+    model = discretised(load_model(machine.xml)[1], machine.data, fine=True)
+    simulation = corrected(found, model)
+    train, select, test = machine.data.split(0)
+    sigma = noise_levels(replace(machine.data, episodes=train.episodes + select.episodes))
+
+    def check(data: Measurements, what: str) -> None:
+        for e in horizon_errors(simulation, simulation.values(), data, sigma, 0):
+            said = [r for r in rows if (r["data"], r["model"], r["horizon"]) == (what, "corrected", str(e.horizon))]
+            assert [r["joint"] for r in said] == list(e.joints)
+            if e.horizon != "whole run" or name != "double_pendulum":  # which tumbles: any rounding grows
+                np.testing.assert_allclose([float(r["rmse"]) for r in said], e.rmse, rtol=0.02)
+
+    check(test, "test")
+    if machine.other is not None:
+        check(machine.other, "other")
+
+
+@pytest.mark.parametrize(("name", "what", "horizon", "measure"), FIRST_ATTEMPT)
+def test_a_first_attempt_is_reached_or_within_the_interval(name: str, what: str, horizon: str, measure: str) -> None:
+    rows = [r for r in committed(name)[1] if (r["data"], r["horizon"]) == (what, horizon)]
+    before, after = ([r for r in rows if r["model"] == model] for model in ("declared", "corrected"))
+    for old, new, first in zip(before, after, FIRST_ATTEMPT[name, what, horizon, measure], strict=True):
+        assert float(new[measure]) < 0.75 * float(old[measure])
+        assert min(float(new["low"]), float(new[measure])) <= first

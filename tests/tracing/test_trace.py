@@ -21,6 +21,8 @@ from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.tracing.adequacy import Adequacy
+from sb3_rpto.tracing.trace import judge
 
 #: the longest steps that the recording and the trace may have
 COARSE = PENDULUM.replace('timestep="0.005"', 'timestep="0.01"')
@@ -146,6 +148,16 @@ def test_dry_friction_is_explained_with_its_level() -> None:
         assert after.rmse[0] < before.rmse[0]
     assert report.force_after[0] < report.force_before[0]
     assert {c.label: c.status for c in report.candidates}["coulomb_friction(hinge)"] == "kept"
+
+
+def test_verdicts() -> None:
+    fine, poor = Adequacy(1.0, 0.9, 1.05, 0.0, 1.0), Adequacy(9.0, 8.0, 11.0, 0.5, 0.0)
+    better, half = Adequacy(2.0, 1.8, 2.2, 0.1, 0.0), Adequacy(5.0, 4.0, 6.0, 0.3, 0.0)
+    assert judge(fine, fine, named=False) == "complete"
+    assert judge(fine, fine, named=True) == "explained"  # windows of another length had shown that something is missing
+    assert judge(poor, fine, named=True) == "explained"
+    assert judge(poor, better, named=True) == "partly explained"
+    assert judge(poor, half, named=True) == judge(poor, poor, named=False) == "unexplained"
 
 
 def test_what_lies_outside_the_library_is_not_explained() -> None:
