@@ -223,7 +223,7 @@ def quick(patch: pytest.MonkeyPatch) -> None:
     """Few windows and long steps in time: a trace of some seconds."""
     patch.setattr(closing, "FILL", 50)
     patch.setattr(windows, "LONGEST", 0.005)
-    patch.setattr(importlib.import_module("sb3_rpto.tracing.trace"), "FEW", 8)
+    patch.setattr(importlib.import_module("sb3_rpto.tracing.prepare"), "FEW", 8)
 
 
 @cache
