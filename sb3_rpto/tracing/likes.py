@@ -44,7 +44,7 @@ class Likes:
         for e in current.effects:
             best, alike = e, list[int]()
             for other in self._likest(e, current.effects):
-                self.selector.say(f"{self.effects[e].label} or {self.effects[other].label}")
+                self.selector.say(1.0, f"{self.effects[e].label} or {self.effects[other].label}")
                 trial = self._exchanged(current, best, other)
                 if self._better(trial, current):
                     clear = self.selector.evidence(trial, current).clear(*self.selector.limit(trial))
@@ -80,7 +80,7 @@ class Likes:
             outside = [i for i in range(len(self.effects)) if i not in rest and self.screening.excited(i)]
             outside = [i for i in outside if self.kinds[i] != "declared"]
             for one in selector.promising(without, outside):
-                selector.say(f"{self.effects[one].label} in the place of two")
+                selector.say(1.0, f"{self.effects[one].label} in the place of two")
                 trial = selector.model([*rest, one], without.fit, EXCHANGED)
                 if not selector.evidence(current, trial).clear(SEEMS):
                     current = trial
@@ -101,7 +101,7 @@ class Likes:
             other = max(same, key=lambda i: self.screening.cosine[e, i], default=e)
             if places < 2 or self.kinds[e] == kind or self.screening.cosine[e, other] < LIKE:
                 continue
-            self.selector.say(f"{self.effects[other].label}, as elsewhere")
+            self.selector.say(1.0, f"{self.effects[other].label}, as elsewhere")
             trial = self.selector.led_on(self._exchanged(model, e, other))
             if self._better(trial, model):
                 model = trial
@@ -114,7 +114,7 @@ class Likes:
             for other in sorted(self.screening.alike(e), key=lambda i: len(self.effects[i].parameters)):
                 if other in model.effects or not self._simpler(other, e):
                     continue
-                self.selector.say(f"{self.effects[other].label} is simpler")
+                self.selector.say(1.0, f"{self.effects[other].label} is simpler")
                 trial = self._exchanged(model, e, other)
                 if self.selector.train.exact and not self.selector.far(model):
                     trial = self.selector.led_on(trial)
@@ -136,7 +136,7 @@ class Likes:
             trial_effects = sorted({swaps.get(e, e) for e in model.effects})
             if len(swaps) < 2 or len(trial_effects) < len(model.effects):
                 continue
-            self.selector.say(f"{kind} in all places")
+            self.selector.say(1.0, f"{kind} in all places")
             begin = model.fit
             for old, new in swaps.items():
                 moved = self._translated(model, old, new).values[self.selector.simulation.slices[new]]

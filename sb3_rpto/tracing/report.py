@@ -97,12 +97,21 @@ class Report:
     :param force_before: force residual of the declared model on test runs, N·m or N, (nv,)
     :param force_after: of the corrected model, (nv,)
     :param learnable: share of what is left that a small regressor predicts, (nv,)
+    :param residuals_before: the force residuals themselves, an item for each run that is long enough
+    :param residuals_after: of the corrected model
     :param findings: all that was found and repaired in the data
     :param noise: of each position column, rad or m
     :param runs: names of the train, select and test runs
     :param judged_apart: whether adequacy is that on select runs; else on the training runs, which were fitted
     :param threshold: t*
     :param horizon: length of the windows in s
+    :param seed: of the trace
+    :param source: the model as it was given
+    :param simulation: the model with all effects, those of no strength among them
+    :param values_before: its parameters with the declared model fitted, (p,)
+    :param values_after: with the corrected one, (p,)
+    :param data: the test runs, or the fitted ones where there are none
+    :param sigma: noise of each position column, rad or m, (m,)
     """
 
     verdict: str

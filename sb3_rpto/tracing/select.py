@@ -38,7 +38,7 @@ ROUNDS, INSTEAD, PROMISING = 3, 8, 4
 #: Typical window error, in units of the noise, that leaves nothing to look forward to.
 ENOUGH = 1.1
 
-Say = Callable[[str], None]
+Say = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Selector:
     :param train: windows to fit
     :param select: windows of runs set apart; None where there are none
     :param threshold: t*, see :func:`sb3_rpto.tracing.trace.trace`
-    :param say: progress
+    :param say: progress: the share of the search that is done, and what is being done
     :param horizon: length of the windows in s, for the gap between folds
     """
 
@@ -106,7 +106,11 @@ class Selector:
         """For the shipped threshold and windows to train and to select on."""
         select = None if windows[1] is None else Problem(simulation, windows[1], scales)
         return cls(
-            Problem(simulation, windows[0], scales), select, THRESHOLD, lambda what: progress(0.6, what), horizon
+            Problem(simulation, windows[0], scales),
+            select,
+            THRESHOLD,
+            lambda share, what: progress(0.2 + 0.5 * share, what),
+            horizon,
         )
 
     @property
@@ -152,7 +156,7 @@ class Selector:
         for e in effects:
             kinds.setdefault(self.simulation.effects[e].kind, []).append(e)
         for _ in range(min(ROUNDS, len(kinds))):
-            self.say(f"another start, with {len(chosen)} of the candidates")
+            self.say(0.0, f"another start, with {len(chosen)} of the candidates")
             fits = {k: part.fit(fit.values, self.free([*chosen, *g]), fit.starts, REFIT) for k, g in kinds.items()}
             best = min(fits, key=lambda k: fits[k].cost)
             chosen += kinds.pop(best)
@@ -229,6 +233,7 @@ class Selector:
         :param limit: default: :meth:`limit` of the model, with its gain
         """
         current, step = outcome.model, max((step for step, _ in outcome.dropped.values()), default=0)
+        begun = len(current.effects)
         while current.effects:
             step += 1
             order, costs = self.removal_costs(current)
@@ -237,7 +242,7 @@ class Selector:
             for drop in _bundles(order, trifles):
                 trial = self.model([e for e in current.effects if e not in drop], current.fit)
                 evidence = self.evidence(current, trial)
-                self.say(f"{len(trial.effects)} effects left")
+                self.say(1 - len(trial.effects) / begun, f"{len(trial.effects)} effects left")
                 if not evidence.clear(*(self.limit(current) if limit is None else (limit, GAIN))):
                     reduced = trial
                     for e in drop:
@@ -292,7 +297,7 @@ class Selector:
                 break
             tried: list[tuple[float, Model, int]] = []
             for e in self.promising(current, [c for c in candidates if c not in current.effects]):
-                self.say(f"looking at {self.simulation.effects[e].label} again")
+                self.say(0.0, f"looking at {self.simulation.effects[e].label} again")
                 trial = self.model([*current.effects, e], current.fit, REFIT + 3)
                 evidence = self.evidence(trial, current)
                 if evidence.clear(*self.limit(trial)):

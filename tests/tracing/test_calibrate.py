@@ -14,7 +14,7 @@ def selector(level: float) -> Selector:
     planted = [CoulombFriction("hinge", level=level)] if level else []
     effects = [CoulombFriction("hinge"), TorqueOffset("hinge")]
     train, select = (problem(effects, recorded(planted, seed=seed)) for seed in (0, 100))
-    return Selector(train, select, 3.5, lambda what: None)
+    return Selector(train, select, 3.5, lambda share, what: None)
 
 
 def test_what_is_in_the_data_does_not_raise_the_threshold() -> None:

@@ -15,7 +15,7 @@ def test_substitution_replaces_a_wrong_effect_by_the_right_one() -> None:
     effects: list[Effect] = [CoulombFriction("hinge"), ViscousFriction("hinge")]
     planted = [CoulombFriction("hinge", level=0.08)]
     train, unseen = (problem(effects, recorded(planted, seed=seed)) for seed in (2, 102))
-    s = Selector(train, unseen, THRESHOLD, lambda what: None)
+    s = Selector(train, unseen, THRESHOLD, lambda share, what: None)
     nothing = train.score(train.null)
     wrong = s.model([1], nothing, 12)
     found = Likes(s, screen(train, nothing)).substitute(Selection(wrong))
@@ -28,7 +28,7 @@ def test_what_does_as_well_is_of_the_class() -> None:
     effects: list[Effect] = [CommandDelay("motor"), ActuatorLag("motor")]
     planted = [ActuatorLag("motor", time_constant=0.004)]
     train, unseen = (problem(effects, recorded(planted, noise=5e-3, seed=seed)) for seed in (2, 102))
-    s = Selector(train, unseen, THRESHOLD, lambda what: None)
+    s = Selector(train, unseen, THRESHOLD, lambda share, what: None)
     nothing = train.score(train.null)
     found = Likes(s, screen(train, nothing)).substitute(Selection(s.model([0], nothing, 12)))
     (kept,) = found.model.effects
@@ -39,7 +39,7 @@ def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
     """A Stribeck friction that has come near a Coulomb's path errs less than a Coulomb's first fit."""
     effects: list[Effect] = [CoulombFriction("hinge"), StribeckFriction("hinge")]
     data = recorded([CoulombFriction("hinge", level=0.08)], noise=0.0, exact=True)
-    s = Selector(problem(effects, data, noise=1e-5), None, THRESHOLD, lambda what: None)
+    s = Selector(problem(effects, data, noise=1e-5), None, THRESHOLD, lambda share, what: None)
     assert s.train.exact
     found = screen(s.train, s.model((), s.train.score(s.train.null)).fit)
     assert found.alike(1) == [0]
@@ -63,7 +63,7 @@ def test_joints_are_built_alike(kept: tuple[int, ...]) -> None:
     effects: list[Effect] = [kind(j) for kind in (CoulombFriction, ViscousFriction) for j in joints]
     there = [CoulombFriction(j, level=level) for j, level in zip(joints, (0.1, 0.06, 0.03))]
     data = recorded(there, model, noise=0.0, exact=True)
-    s = Selector(problem(effects, data, noise=1e-5, model=model), None, THRESHOLD, lambda what: None)
+    s = Selector(problem(effects, data, noise=1e-5, model=model), None, THRESHOLD, lambda share, what: None)
     found = screen(s.train, s.model((), s.train.score(s.train.null)).fit)
     wrong = s.model(kept, s.train.fit(s.train.null, s.free(kept)))
     if 0 in kept:

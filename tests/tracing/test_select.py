@@ -25,7 +25,7 @@ def selector(planted: list[Effect], effects: list[Effect] | None = None, seed: i
     effects = effects or [CoulombFriction("hinge"), TorqueOffset("hinge"), QuadraticDrag("hinge")]
     train = problem(effects, recorded(planted, seed=seed))
     select = problem(effects, recorded(planted, seed=seed + 100))
-    return Selector(train, select, THRESHOLD, lambda what: None)
+    return Selector(train, select, THRESHOLD, lambda share, what: None)
 
 
 def eliminated(s: Selector) -> Selection:
@@ -271,7 +271,7 @@ def test_a_fold_is_judged_as_by_a_fit_to_the_others() -> None:
     """One Gauss-Newton step from the fit to all windows is nearly that fit."""
     effects: list[Effect] = [CoulombFriction("hinge"), TorqueOffset("hinge")]
     p = problem(effects, recorded([CoulombFriction("hinge", level=0.05)], episodes=3, noise=2e-3), noise=2e-3)
-    s = Selector(p, None, THRESHOLD, lambda what: None, 0.4)
+    s = Selector(p, None, THRESHOLD, lambda share, what: None, 0.4)
     full = s.model((0, 1), p.score(p.null), 20)
     assert len(s.folds) == 6
     expected, inside = [], []
