@@ -46,6 +46,7 @@ class Parameter:
     :param upper: largest value
     :param null: value at which the effect does nothing; for a shape parameter (any value does) where a fit starts
     :param shape: True when the parameter means nothing while the others are at their null values
+    :param starts: of a shape, where a fit may start as well: from its null the others may seem to be of no use
     """
 
     name: str
@@ -55,6 +56,7 @@ class Parameter:
     upper: float = np.inf
     null: float = 0.0
     shape: bool = False
+    starts: tuple[float, ...] = ()
 
     def size_for(self, scales: Scales) -> float:
         """:attr:`size` where things are as large as ``scales`` says."""

@@ -18,7 +18,7 @@ from sb3_rpto.tracing.calibrate import LEVEL, strongest
 from sb3_rpto.tracing.prepare import prepare
 from sb3_rpto.tracing.report import write_atomically
 from sb3_rpto.tracing.screen import screen
-from sb3_rpto.tracing.search import fit_declared, worth_fitting
+from sb3_rpto.tracing.search import aligned, fit_declared, worth_fitting
 from sb3_rpto.tracing.select import THRESHOLD
 
 NAME = "sb3-rpto benchmark threshold"
@@ -84,7 +84,7 @@ def needed(system: str, noise: float, seed: int, episodes: int = 10, duration: f
     on = set_up.selectors(set_up.length, lambda share, what: None)
     base = on.fine.model((), fit_declared(on.rough, seed), iterations=10)
     chosen = worth_fitting(on.fine, screen(on.fine.train, base.fit))
-    t = strongest(on.rough, base.fit, chosen)
+    t = strongest(aligned(on, base.fit.values).rough, base.fit, chosen)
     seconds = round(time.process_time() - start, 1)
     return {
         "system": system,

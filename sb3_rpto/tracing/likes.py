@@ -79,9 +79,9 @@ class Likes:
             without = selector.model(rest, current.fit)
             outside = [i for i in range(len(self.effects)) if i not in rest and self.screening.excited(i)]
             outside = [i for i in outside if self.kinds[i] != "declared"]
-            for one in selector.promising(without, outside):
+            for one, begin in selector.promising(without, outside):
                 selector.say(1.0, f"{self.effects[one].label} in the place of two")
-                trial = selector.model([*rest, one], without.fit, EXCHANGED)
+                trial = selector.model([*rest, one], begin, EXCHANGED)
                 if not selector.evidence(current, trial).clear(SEEMS):
                     current = trial
                     selection.alike[one] = [i for i in self.screening.alike(one) if i not in trial.effects]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sb3_rpto.tracing.adequacy import Adequacy, adequacy
 from sb3_rpto.tracing.calibrate import calibrated
 from sb3_rpto.tracing.concentrate import led_on
-from sb3_rpto.tracing.identify import Fit
+from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.screen import Screening, screen
 from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
@@ -70,6 +70,7 @@ def find(
     before = judged(on.fine, base, seed)
     if before.adequate:
         return Found(on, base, before, None, Selection(base), before)
+    on = aligned(on, base.fit.values)
     on.say(0.15, "screening the candidates")
     screening = screen(on.fine.train, base.fit)
     if calibrate:
@@ -87,6 +88,33 @@ def find(
             base = on.fine.model((), on.fine.train.score(base.fit.values), iterations=10)
             before = judged(on.fine, base, seed)
     return Found(on, base, before, screening, selection, judged(on.fine, selection.model, seed))
+
+
+def aligned(on: Selectors, values: np.ndarray) -> Selectors:
+    """The same with the recordings of the rough selector less what its steps in time err by.
+
+    Long semi-implicit steps err by about a milliradian in half a second, as much as noise, and effects would be found
+    to make up for it. The error hardly depends on the parameters, so one set of them tells it.
+
+    :param on: windows
+    :param values: parameters near the best ones, (p,)
+    """
+    fine, rough = (s.simulation.model.opt for s in (on.fine, on.rough))
+    if (fine.timestep, fine.integrator) == (rough.timestep, rough.integrator):
+        return on
+
+    def less(problem: Problem, exact: Problem) -> Problem:
+        count, starts = np.arange(len(exact.windows)), exact.score(values).starts
+        rows = np.tile(values, (len(count), 1))
+        error = problem.predict(rows, starts, count) - exact.predict(rows, starts, count)
+        measured = exact.windows.measured + np.nan_to_num(error)
+        return Problem(problem.simulation, replace(problem.windows, measured=measured), problem.scales)
+
+    old, select = on.rough, None
+    if old.select is not None and on.fine.select is not None:
+        select = less(old.select, on.fine.select)
+    rough_selector = Selector(less(old.train, on.fine.train), select, old.threshold, old.say, old.horizon)
+    return replace(on, rough=rough_selector)
 
 
 def fit_declared(selector: Selector, seed: int) -> Fit:
@@ -120,6 +148,14 @@ def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
     return chosen
 
 
+def worth_a_look(selector: Selector, screening: Screening) -> list[int]:
+    """Those worth fitting, and the excited ones that have a shape: with another one they may look like no other."""
+    effects = selector.simulation.effects
+    chosen = worth_fitting(selector, screening)
+    shaped = [i for i, e in enumerate(effects) if any(p.shape for p in e.parameters) and screening.excited(i)]
+    return sorted({*chosen, *shaped})
+
+
 def search(on: Selectors, base: Model, screening: Screening) -> Selection:
     """Joint fit of all excited candidates, elimination backwards, a last look forward, substitution by like ones.
 
@@ -131,28 +167,32 @@ def search(on: Selectors, base: Model, screening: Screening) -> Selection:
     :param screening: of the candidates
     """
     rough, chosen = on.rough, worth_fitting(on.fine, screening)
+    looked_at = worth_a_look(on.fine, screening)
     on.say(0.2, f"fitting {len(chosen)} candidates together")
     alone = rough.model((), base.fit)
     begins = [model for model in rough.together(chosen, alone.fit) if model is not None]
     nearer = [m for m in begins if not rough.far(m) or rough.evidence(m, alone).clear(SEEMS)]
     if nearer:  # what seems to matter stays while much else may still be wrong
-        selection = rough.look_forward(rough.eliminate(Selection(nearer[0]), SEEMS), chosen)
+        selection = rough.look_forward(rough.eliminate(Selection(nearer[0]), SEEMS), looked_at)
     else:
-        selection = rough.look_forward(Selection(alone), chosen, INSTEAD)
+        selection = rough.look_forward(Selection(alone), looked_at, INSTEAD)
     return settle(on, selection, screening)
 
 
 def go_on(on: Selectors, found: Selection, screening: Screening) -> Selection:
     """Go on from what was found with other windows: what is missing is added, what is not needed goes."""
+    on = aligned(on, found.model.fit.values)
     rough = on.rough
     begin = rough.model(found.model.effects, rough.train.score(found.model.fit.values), iterations=10)
-    selection = rough.look_forward(Selection(begin, dropped=dict(found.dropped)), worth_fitting(on.fine, screening))
+    selection = rough.look_forward(Selection(begin, dropped=dict(found.dropped)), worth_a_look(on.fine, screening))
     return settle(on, selection, screening)
 
 
 def settle(on: Selectors, selection: Selection, screening: Screening) -> Selection:
     """Elimination to what is clearly needed, substitution by like effects, and the evidence for what remains."""
+    on = aligned(on, selection.model.fit.values)
     selector, rough = on.fine, on.rough
+    selection.model = rough.model(selection.model.effects, selection.model.fit)
     selection = rough.eliminate(selection)
     on.say(0.7, "trying like effects in their place")
     likes = Likes(rough, screening)

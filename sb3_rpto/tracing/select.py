@@ -296,9 +296,9 @@ class Selector:
             if np.median(current.errors) < ENOUGH:
                 break
             tried: list[tuple[float, Model, int]] = []
-            for e in self.promising(current, [c for c in candidates if c not in current.effects]):
+            for e, begin in self.promising(current, [c for c in candidates if c not in current.effects]):
                 self.say(0.0, f"looking at {self.simulation.effects[e].label} again")
-                trial = self.model([*current.effects, e], current.fit, REFIT + 3)
+                trial = self.model([*current.effects, e], begin, JOINT)
                 evidence = self.evidence(trial, current)
                 if evidence.clear(*self.limit(trial)):
                     tried.append((evidence.gain, trial, e))
@@ -308,17 +308,35 @@ class Selector:
             selection.dropped.pop(added, None)
         return selection
 
-    def promising(self, model: Model, outside: Sequence[int]) -> list[int]:
-        """The effects outside that lower the log errors or the cost most in a short fit to every third window."""
+    def promising(self, model: Model, outside: Sequence[int]) -> list[tuple[int, Fit]]:
+        """The effects outside that lower the log errors or the cost most in a short fit to every third window.
+
+        :return: each with where a fit may begin: the model's, and the shape that did best
+        """
         some = np.arange(0, len(self.train.windows), 3)
         part, begin = self.train.on(some), model.fit.starts[some]
         base = part.fit(model.fit.values, self.free(model.effects), begin, 3)
-        gains = {}
+        gains, begins = {}, {}
         for e in outside:
-            fit = part.fit(base.values, self.free([*model.effects, e]), base.starts, REFIT + 1)
+            free = self.free([*model.effects, e])
+            trials = [(v, part.fit(v, free, base.starts, REFIT + 1)) for v in self._shapes(base.values, e)]
+            values, fit = min(trials, key=lambda trial: trial[1].cost)
             gains[e] = max(float(np.mean(np.log(base.errors) - np.log(fit.errors))), 1 - fit.cost / base.cost)
+            s = self.simulation.slices[e]
+            begins[e] = replace(model.fit, values=model.fit.values.copy(), linear=None)
+            begins[e].values[s] = values[s]
         best = sorted(outside, key=lambda e: -gains[e])[:PROMISING]
-        return [e for e in best if gains[e] > GAIN]
+        return [(e, begins[e]) for e in best if gains[e] > GAIN]
+
+    def _shapes(self, values: np.ndarray, effect: int) -> list[np.ndarray]:
+        """The parameters with an effect's shape where fits may start."""
+        found = [values]
+        s = self.simulation.slices[effect]
+        for i, parameter in enumerate(self.simulation.effects[effect].parameters, s.start):
+            for start in parameter.starts:
+                found.append(values.copy())
+                found[-1][i] = start
+        return found
 
 
 def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:
