@@ -132,9 +132,10 @@ class Backlash(Effect):
 
 @register
 class ActuatorLag(Effect):
-    r"""First-order lag :math:`T \dot y = u - y`, exact for a command held over the step, starting at the first command.
+    r"""First-order lag :math:`T \dot y = u - y` of a command held over each step, starting at the first command.
 
-    The same as MuJoCo's ``dyntype="filterexact"`` with ``actearly``.
+    What acts in a step is the mean of :math:`y` over it, which is exact: the value at the step's end, MuJoCo's
+    ``dyntype="filterexact"`` with ``actearly``, comes half a step too early.
     """
 
     kind = "actuator_lag"
@@ -147,6 +148,6 @@ class ActuatorLag(Effect):
     def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
         """Filter."""
         # Written this way the null, where the past has no weight, gives u without rounding.
-        keep = np.exp(-dt / np.maximum(x[:, 0], 1e-12))
-        memory["y"] = u + (memory.get("y", u) - u) * keep
-        return memory["y"]
+        behind, gone = memory.get("y", u) - u, -np.expm1(-dt / np.maximum(x[:, 0], 1e-12))
+        memory["y"] = u + behind * (1 - gone)
+        return u + behind * gone * x[:, 0] / dt

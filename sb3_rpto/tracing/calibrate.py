@@ -45,7 +45,8 @@ def strongest(selector: Selector, base: Fit, chosen: list[int]) -> float:
     :param base: fit of the declared parameters
     :param chosen: indices of the candidates
     """
-    joint, _ = selector.together(chosen, selector.model((), base).fit)
+    alone = selector.model((), base).fit
+    joint, _ = selector.together(chosen, alone, alone)
     outcome, level = selector.eliminate(Selection(joint), 0.0), 0.0
     while outcome.model.effects:
         current = outcome.model

@@ -10,6 +10,7 @@ import numpy as np
 from sb3_rpto.tracing.adequacy import Adequacy, adequacy
 from sb3_rpto.tracing.calibrate import calibrated
 from sb3_rpto.tracing.concentrate import led_on
+from sb3_rpto.tracing.evidence import GAIN
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.screen import Screening, screen
@@ -157,25 +158,36 @@ def worth_a_look(selector: Selector, screening: Screening) -> list[int]:
 
 
 def search(on: Selectors, base: Model, screening: Screening) -> Selection:
-    """Joint fit of all excited candidates, elimination backwards, a last look forward, substitution by like ones.
+    """A look for single effects, joint fit of all candidates, elimination backwards, substitution by like ones.
 
-    Where the joint fit ends far from the noise and no nearer than it began, the best few kinds at all their places take
-    its place, and where they do no better either, effects are added one by one.
+    The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there.
+    Where it ends far from the noise and no
+    nearer than the declared parameters alone, or worse than those few, the best few kinds at all their places take its
+    place, and where they do no better either, effects are added one by one.
 
     :param on: windows
     :param base: the declared parameters alone
     :param screening: of the candidates
     """
-    rough, chosen = on.rough, worth_fitting(on.fine, screening)
-    looked_at = worth_a_look(on.fine, screening)
-    on.say(0.2, f"fitting {len(chosen)} candidates together")
+    rough, looked_at = on.rough, worth_a_look(on.fine, screening)
     alone = rough.model((), base.fit)
-    begins = [model for model in rough.together(chosen, alone.fit) if model is not None]
+    on.say(0.2, "looking for single effects")
+    first = rough.look_forward(Selection(alone), looked_at, alike=screening.alike)
+    chosen = sorted({*worth_fitting(on.fine, screening), *first.model.effects})
+    if first.model.effects:
+        on = aligned(on, first.model.fit.values)
+        rough, begin = on.rough, first.model
+        alone, first.model = rough.model((), base.fit), rough.model(begin.effects, begin.fit)
+    if rough.promise(first.model, chosen) < GAIN:  # all together could not be clear
+        return settle(on, first, screening)
+    on.say(0.3, f"fitting {len(chosen)} candidates together")
+    begins = [model for model in rough.together(chosen, alone.fit, first.model.fit) if model is not None]
     nearer = [m for m in begins if not rough.far(m) or rough.evidence(m, alone).clear(SEEMS)]
+    nearer = [m for m in nearer if not rough.evidence(first.model, m).clear(SEEMS)]
     if nearer:  # what seems to matter stays while much else may still be wrong
         selection = rough.look_forward(rough.eliminate(Selection(nearer[0]), SEEMS), looked_at)
     else:
-        selection = rough.look_forward(Selection(alone), looked_at, INSTEAD)
+        selection = rough.look_forward(first, looked_at, INSTEAD, screening.alike)
     return settle(on, selection, screening)
 
 

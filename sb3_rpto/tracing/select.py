@@ -33,8 +33,9 @@ TRIFLE = 0.01
 TRIED = 3
 #: t from which on an effect seems to matter.
 SEEMS = 1.5
-#: Rounds of the look forward, after a joint fit and in its place, and candidates fitted in each.
-ROUNDS, INSTEAD, PROMISING = 3, 8, 4
+#: Rounds of the look forward, after a joint fit and in its place; candidates of each that are fitted to some windows
+#: and to all.
+ROUNDS, INSTEAD, QUICK, PROMISING = 3, 8, 10, 4
 #: Typical window error, in units of the noise, that leaves nothing to look forward to.
 ENOUGH = 1.1
 
@@ -129,15 +130,18 @@ class Selector:
             np.concatenate([np.arange(s.start, s.stop) for s in keep]).astype(int) if keep else np.empty(0, dtype=int)
         )
 
-    def together(self, effects: Sequence[int], base: Fit) -> tuple[Model, Model | None]:
-        """Fit all candidates at once, from the base; where that ends badly, again from the best few of their kinds.
+    def together(self, effects: Sequence[int], base: Fit, begin: Fit) -> tuple[Model, Model | None]:
+        """Fit all candidates at once; where that ends badly, again from the best few of their kinds.
 
         The cost has local minima where many effects begin at their nulls.
 
+        :param effects: indices of the candidates
+        :param base: the declared parameters alone
+        :param begin: where the fit begins
         :return: the model of all, and that of the best few kinds where it was needed
         """
         free = self.free(effects)
-        best, few = self.train.fit(base.values, free, base.starts, JOINT, tolerance=3e-3), None
+        best, few = self.train.fit(begin.values, free, begin.starts, JOINT, tolerance=3e-3), None
         if np.median(best.errors) > ENOUGH:
             few = self._best_few(effects, base)
             other = self.train.fit(few.fit.values, free, base.starts, JOINT, tolerance=3e-3)
@@ -286,10 +290,22 @@ class Selector:
             selection.dropped[worst] = (0, selection.evidence[worst])
             selection.model = self.model([i for i in current.effects if i != worst], current.fit)
 
-    def look_forward(self, selection: Selection, candidates: Sequence[int], rounds: int = ROUNDS) -> Selection:
-        """Where much is missing, the joint fit may end far from the best: add what is clearly needed.
+    def look_forward(
+        self,
+        selection: Selection,
+        candidates: Sequence[int],
+        rounds: int = ROUNDS,
+        alike: Callable[[int], Sequence[int]] = lambda effect: (),
+    ) -> Selection:
+        """Add the effects that are clearly needed one by one, as long as much is missing.
 
-        Each round fits the effects outside one by one, first roughly, and keeps the best if it is clear.
+        Each round fits the effects outside, first roughly, and keeps the best if it is clear, or one of its class that
+        seems better.
+
+        :param selection: begun with
+        :param candidates: of each class one
+        :param rounds: most effects to add
+        :param alike: the others of the class of an effect
         """
         for _ in range(rounds):
             current = selection.model
@@ -297,16 +313,42 @@ class Selector:
                 break
             tried: list[tuple[float, Model, int]] = []
             for e, begin in self.promising(current, [c for c in candidates if c not in current.effects]):
-                self.say(0.0, f"looking at {self.simulation.effects[e].label} again")
-                trial = self.model([*current.effects, e], begin, JOINT)
+                trial = self._with(current, e, begin)
                 evidence = self.evidence(trial, current)
                 if evidence.clear(*self.limit(trial)):
                     tried.append((evidence.gain, trial, e))
             if not tried:
                 break
-            _, selection.model, added = max(tried, key=lambda found: found[0])
+            best, added = self._simplest_of(tried)
+            seen = [added, *current.effects, *(e for _, _, e in tried)]
+            for other in [e for e in alike(added) if e not in seen]:
+                trial = self._with(current, other, current.fit)
+                if self.evidence(trial, best).clear(SEEMS):
+                    best, added = trial, other
+            selection.model = best
             selection.dropped.pop(added, None)
         return selection
+
+    def _simplest_of(self, tried: list[tuple[float, Model, int]]) -> tuple[Model, int]:
+        """Of models with their gains and what was added, the simplest that the best does not seem to beat."""
+        _, best, added = max(tried, key=lambda found: found[0])
+        for _, model, e in sorted(tried, key=lambda found: len(self.simulation.effects[found[2]].parameters)):
+            if not self.evidence(best, model).clear(SEEMS):
+                return model, e
+        return best, added
+
+    def _with(self, model: Model, effect: int, begin: Fit) -> Model:
+        self.say(0.0, f"looking at {self.simulation.effects[effect].label}")
+        return self.model([*model.effects, effect], begin, JOINT)
+
+    def promise(self, model: Model, effects: Sequence[int]) -> float:
+        """Share of the error that a model would save with all of some effects, if the cost were quadratic."""
+        free = self.free([*effects, *model.effects])
+        linear = self.train.linear(model.fit, free)
+        normal, gradient = linear.normal.sum(0), linear.gradient.sum(0)
+        ridge = 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(free))
+        saved = float(gradient @ np.linalg.solve(normal + ridge, gradient)) / model.fit.cost
+        return 1 - float(np.sqrt(max(0.0, 1 - saved)))
 
     def promising(self, model: Model, outside: Sequence[int]) -> list[tuple[int, Fit]]:
         """The effects outside that lower the log errors or the cost most in a short fit to every third window.
@@ -317,7 +359,7 @@ class Selector:
         part, begin = self.train.on(some), model.fit.starts[some]
         base = part.fit(model.fit.values, self.free(model.effects), begin, 3)
         gains, begins = {}, {}
-        for e in outside:
+        for e in self._promised(part, base, model.effects, outside):
             free = self.free([*model.effects, e])
             trials = [(v, part.fit(v, free, base.starts, REFIT + 1)) for v in self._shapes(base.values, e)]
             values, fit = min(trials, key=lambda trial: trial[1].cost)
@@ -325,8 +367,21 @@ class Selector:
             s = self.simulation.slices[e]
             begins[e] = replace(model.fit, values=model.fit.values.copy(), linear=None)
             begins[e].values[s] = values[s]
-        best = sorted(outside, key=lambda e: -gains[e])[:PROMISING]
+        best = sorted(gains, key=lambda e: -gains[e])[:PROMISING]
         return [(e, begins[e]) for e in best if gains[e] > GAIN]
+
+    def _promised(self, part: Problem, base: Fit, kept: Sequence[int], outside: Sequence[int]) -> list[int]:
+        """The effects outside that promise most to first order, and those that may promise more with another shape."""
+        every = self.free([*kept, *outside])
+        linear = part.linear(base, every)
+        normal, gradient = linear.normal.sum(0), linear.gradient.sum(0)
+        normal = normal + 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(every))
+        falls = {}
+        for e in outside:
+            rows = np.flatnonzero(np.isin(every, self.free([*kept, e])))
+            falls[e] = float(gradient[rows] @ np.linalg.solve(normal[np.ix_(rows, rows)], gradient[rows]))
+        best = sorted(outside, key=lambda e: -falls[e])[:QUICK]
+        return [e for e in outside if e in best or any(p.starts for p in self.simulation.effects[e].parameters)]
 
     def _shapes(self, values: np.ndarray, effect: int) -> list[np.ndarray]:
         """The parameters with an effect's shape where fits may start."""

@@ -332,18 +332,19 @@ def test_gain_sits_where_the_force_is_linear_in_it() -> None:
     assert LIBRARY["command_gain"].places(model) == ["plain", "affine"]
 
 
-def test_lag_is_filterexact() -> None:
-    """Ten steps of MuJoCo's own filter, started at the first command."""
+def test_lag_is_the_mean_of_filterexact() -> None:
+    """Ten steps of MuJoCo's own filter, started at the first command; T dy/dt = u - y tells its mean over each."""
     model = mujoco.MjModel.from_xml_string("""
     <mujoco><option timestep="0.01"/><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>
     <actuator><general joint="j" dyntype="filterexact" dynprm="0.03" actearly="true"/></actuator></mujoco>""")
     data = mujoco.MjData(model)
     data.act[:] = RAMP[0]
-    expected = []
+    ends = [RAMP[0]]
     for u in RAMP:
         data.ctrl[:] = u
         mujoco.mj_step(model, data)
-        expected.append(data.actuator_force[0])
+        ends.append(data.actuator_force[0])
+    expected = RAMP - 0.03 * np.diff(ends) / 0.01
     np.testing.assert_allclose(sent("actuator_lag", RAMP, time_constant=0.03), expected, rtol=1e-12)
 
 

@@ -31,7 +31,7 @@ def selector(planted: list[Effect], effects: list[Effect] | None = None, seed: i
 def eliminated(s: Selector) -> Selection:
     count = range(len(s.simulation.effects))
     base = s.model((), s.train.score(s.train.null))
-    full, _ = s.together(list(count), base.fit)
+    full, _ = s.together(list(count), base.fit, base.fit)
     return s.eliminate(Selection(full), s.threshold)
 
 
@@ -168,8 +168,8 @@ def test_a_joint_fit_that_is_no_better_than_none_gives_way_to_the_best_few_kinds
         eliminated_from.append(selection.model.effects)
         return eliminate(selection, limit)
 
-    def ending_badly(effects: list[int], fit: Fit) -> tuple[Model, Model]:
-        joint, _ = together(effects, fit)
+    def ending_badly(effects: list[int], fit: Fit, begin: Fit) -> tuple[Model, Model]:
+        joint, _ = together(effects, fit, begin)
         few = s.model([COULOMB, DRAG], fit)
         stuck = 2 * base.errors
         return replace(joint, errors=stuck) if joint_stuck else joint, replace(few, errors=stuck) if few_stuck else few
