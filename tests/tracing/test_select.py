@@ -2,18 +2,19 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
-from simulated import compiled, problem, recorded
+from simulated import PENDULUM, compiled, problem, recorded
 
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
-from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag
+from sb3_rpto.effects.friction import CoulombFriction, PositionFriction, QuadraticDrag, StribeckFriction
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit
 from sb3_rpto.tracing.screen import screen
-from sb3_rpto.tracing.search import Selectors, search
+from sb3_rpto.tracing.search import Selectors, aligned, search
 from sb3_rpto.tracing.select import FAR, INSTEAD, LIKELY, ROUNDS, TENTH, Model, Selection, Selector
 from sb3_rpto.tracing.windows import cut
 
@@ -160,9 +161,10 @@ def test_a_joint_fit_that_is_no_better_than_none_gives_way_to_the_best_few_kinds
     eliminated_from: list[tuple[int, ...]] = []
     look, eliminate, together = s.look_forward, s.eliminate, s.together
 
-    def looking(selection: Selection, candidates: list[int], rounds: int = ROUNDS) -> Selection:
+    def looking(selection: Selection, candidates: list[int], rounds: int = ROUNDS, alike: Any = None) -> Selection:
         rounds_taken.append(rounds)
-        return look(selection, candidates, rounds)
+        # as if no single effect were clear at first
+        return look(selection, candidates, rounds) if len(rounds_taken) > 1 else selection
 
     def eliminating(selection: Selection, limit: float | None = None) -> Selection:
         eliminated_from.append(selection.model.effects)
@@ -177,9 +179,64 @@ def test_a_joint_fit_that_is_no_better_than_none_gives_way_to_the_best_few_kinds
     s.look_forward, s.eliminate, s.together = looking, eliminating, ending_badly  # type: ignore[method-assign]
     selection = search(Selectors(s, s, lambda share, what: None), base, screen(s.train, base.fit))
     assert selection.model.effects == (COULOMB,)
-    assert rounds_taken == [INSTEAD if joint_stuck and few_stuck else ROUNDS]
+    assert rounds_taken == [ROUNDS, INSTEAD if joint_stuck and few_stuck else ROUNDS]
     if not few_stuck:
         assert set(eliminated_from[0]) == ({COULOMB, DRAG} if joint_stuck else {COULOMB, OFFSET, DRAG})
+
+
+def test_where_a_single_effect_leaves_nothing_all_together_are_not_fitted() -> None:
+    s = selector([CoulombFriction("hinge", level=0.08)])
+    base = s.model((), s.train.score(s.train.null))
+    s.together = None  # type: ignore[method-assign, assignment]
+    assert s.promise(base, [COULOMB, OFFSET, DRAG]) > 0.5
+    selection = search(Selectors(s, s, lambda share, what: None), base, screen(s.train, base.fit))
+    assert selection.model.effects == (COULOMB,)
+    assert s.promise(selection.model, [COULOMB, OFFSET, DRAG]) < GAIN
+
+
+def test_of_effects_that_do_as_well_the_simpler_one_is_added() -> None:
+    s = selector([CoulombFriction("hinge", level=0.08)], [StribeckFriction("hinge"), CoulombFriction("hinge")])
+    base = s.model((), s.train.score(s.train.null))
+    assert s.look_forward(Selection(base), [0, 1]).model.effects == (1,)
+
+
+def test_one_of_its_class_may_take_the_place_of_what_is_added() -> None:
+    s = selector([CoulombFriction("hinge", level=0.08)])
+    base = s.model((), s.train.score(s.train.null))
+    assert s.look_forward(Selection(base), [DRAG], rounds=1, alike=lambda e: [COULOMB]).model.effects == (COULOMB,)
+
+
+def test_a_shape_that_hides_an_effect_is_left() -> None:
+    """At its null phase the friction would act where the pole hangs, and there is none."""
+    there = PositionFriction("hinge", amplitude=0.1, phase=2.9)
+    s = selector([there], [PositionFriction("hinge"), TorqueOffset("hinge")])
+    base = s.model((), s.train.score(s.train.null))
+    found = s.look_forward(Selection(base), [0, 1]).model
+    assert found.effects == (0,)
+    np.testing.assert_allclose(found.fit.values[:2], there.values, rtol=0.1)
+
+
+# --- coarse steps -----------------------------------------------------------------------------------------------------
+
+
+def test_recordings_less_the_error_of_coarse_steps_are_met_by_them() -> None:
+    """Without noise: what is left is the change of that error with the start."""
+    effects: list[Effect] = [TorqueOffset("hinge")]
+    data = recorded(noise=1e-9, model=compiled(PENDULUM.replace("0.005", "0.001")))
+
+    def rough_or_fine(integrator: str) -> Selector:
+        model = compiled(PENDULUM.replace("RK4", integrator))
+        return Selector(problem(effects, data, model, noise=1e-4), None, THRESHOLD, lambda share, what: None)
+
+    on = Selectors(rough_or_fine("RK4"), rough_or_fine("Euler"), lambda share, what: None)
+    null = on.fine.train.null
+    after = aligned(on, null)
+    assert after.fine is on.fine
+    errors = [np.median(p.score(null).errors) for p in (on.fine.train, on.rough.train, after.rough.train)]
+    assert errors[1] > 3 * errors[0]
+    assert errors[2] == pytest.approx(errors[0], rel=0.2)
+    alike = Selectors(on.fine, on.fine, on.say)
+    assert aligned(alike, null) is alike
 
 
 def test_looking_forward_brings_a_wrongly_dropped_effect_back() -> None:
