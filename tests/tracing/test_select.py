@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from simulated import PENDULUM, compiled, problem, recorded
 
+from sb3_rpto.effects import declare
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, PositionFriction, QuadraticDrag, StribeckFriction
@@ -206,14 +207,19 @@ def test_one_of_its_class_may_take_the_place_of_what_is_added() -> None:
     assert s.look_forward(Selection(base), [DRAG], rounds=1, alike=lambda e: [COULOMB]).model.effects == (COULOMB,)
 
 
-def test_a_shape_that_hides_an_effect_is_left() -> None:
-    """At its null phase the friction would act where the pole hangs, and there is none."""
+def test_a_shape_that_hides_an_effect_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The declared damping takes the mean friction; the rest is less than nothing where the null phase has it most."""
     there = PositionFriction("hinge", amplitude=0.1, phase=2.9)
-    s = selector([there], [PositionFriction("hinge"), TorqueOffset("hinge")])
-    base = s.model((), s.train.score(s.train.null))
-    found = s.look_forward(Selection(base), [0, 1]).model
-    assert found.effects == (0,)
-    np.testing.assert_allclose(found.fit.values[:2], there.values, rtol=0.1)
+
+    def found() -> Model:
+        s = selector([there], [PositionFriction("hinge"), *declare(compiled(), ["hinge.damping"])])
+        base = s.model((), s.train.score(s.train.null), iterations=20)
+        return s.look_forward(Selection(base), [0]).model
+
+    np.testing.assert_allclose(found().fit.values, [*there.values, 0.05], rtol=0.1)
+    phase = replace(PositionFriction.parameters[1], starts=())
+    monkeypatch.setattr(PositionFriction, "parameters", (PositionFriction.parameters[0], phase))
+    assert found().effects == ()
 
 
 # --- coarse steps -----------------------------------------------------------------------------------------------------
