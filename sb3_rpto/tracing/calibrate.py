@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from sb3_rpto.tracing.identify import Fit, Problem
-from sb3_rpto.tracing.select import TRIED, Selection, Selector
+from sb3_rpto.tracing.select import LIKELY, TRIED, Selection, Selector
 
 #: t* is this quantile of the thresholds that complete sets need.
 LEVEL = 0.95
 
 
 def calibrated(selector: Selector, base: Fit, chosen: list[int], sets: int, seed: int) -> float:
-    """t*: the threshold that names no effect in 95 % of complete sets.
+    """t*: the threshold that names no effect in 95 % of complete sets, at least that of a single test.
 
     Each set is simulated from the fitted declared model in the windows at hand, with the estimated noise; all chosen
     candidates are fitted to it and then eliminated to the last.
@@ -25,7 +25,7 @@ def calibrated(selector: Selector, base: Fit, chosen: list[int], sets: int, seed
     :param sets: number of sets; 20 leave one above the threshold
     :param seed: of the noise
     """
-    return float(np.quantile([needed(selector, base, chosen, seed + i) for i in range(sets)], LEVEL))
+    return max(LIKELY, float(np.quantile([needed(selector, base, chosen, seed + i) for i in range(sets)], LEVEL)))
 
 
 def needed(selector: Selector, base: Fit, chosen: list[int], seed: int) -> float:

@@ -14,8 +14,8 @@ from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.windows import Windows
 
-#: t*, above what 95 % of complete sets need to have nothing named (`benchmark threshold`); `calibrate` measures
-#: it for the data at hand.
+#: t*, well above what complete sets need to have nothing named (`benchmark threshold`: at most 2.0 in 30, most 0), as
+#: real noise is not theirs; `calibrate` measures it for the data at hand.
 THRESHOLD = 3.5
 #: Typical window error, in units of the noise, above which it is the model's more than the noise's.
 FAR = 2.0
