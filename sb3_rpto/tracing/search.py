@@ -161,9 +161,8 @@ def search(on: Selectors, base: Model, screening: Screening) -> Selection:
     """A look for single effects, joint fit of all candidates, elimination backwards, substitution by like ones.
 
     The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there.
-    Where it ends far from the noise and no
-    nearer than the declared parameters alone, or worse than those few, the best few kinds at all their places take its
-    place, and where they do no better either, effects are added one by one.
+    Where it ends far from the noise and no nearer than the declared parameters alone, or worse than those few, the best
+    few kinds at all their places take its place, and where they do no better either, effects are added one by one.
 
     :param on: windows
     :param base: the declared parameters alone
