@@ -358,25 +358,34 @@ class PhysicalDynamics(Dynamics):
 
     def _name_unseen(self, unseen: np.ndarray) -> None:
         """Warn once of parameters that the data do not show."""
-        names = tuple(self.names[i] for i in np.flatnonzero(unseen))
-        if set(names) - set(self._unseen):
-            warnings.warn(
-                f"the target's data do not show {', '.join(names)}: left at what it was; do not declare it, or move so "
-                "that it matters",
-                stacklevel=3,
-            )
+        names = self._which(unseen)
+        _warn_of_new(
+            names,
+            self._unseen,
+            f"the target's data do not show {', '.join(names)}: left at what it was; do not declare it, or move so "
+            "that it matters",
+        )
         self._unseen = names
 
     def _name_entangled(self, entangled: np.ndarray, held: np.ndarray) -> None:
         """Warn once of parameters that the data do not tell apart."""
-        names, stay = (tuple(self.names[i] for i in np.flatnonzero(which)) for which in (entangled, held))
-        if set(names) - set(self._entangled):
-            warnings.warn(
-                f"the target's data do not tell {', '.join(names)} apart: {', '.join(stay)} left at what it was, the "
-                "rest is fitted to that and has no standard error; declare fewer of them, or add what is known of one",
-                stacklevel=3,
-            )
+        names = self._which(entangled)
+        _warn_of_new(
+            names,
+            self._entangled,
+            f"the target's data do not tell {', '.join(names)} apart: {', '.join(self._which(held))} left at what it "
+            "was, the rest is fitted to that and has no standard error; declare fewer of them, or add what is known of "
+            "one",
+        )
         self._entangled = names
+
+    def _which(self, marked: np.ndarray) -> tuple[str, ...]:
+        return tuple(self.names[i] for i in np.flatnonzero(marked))
+
+
+def _warn_of_new(names: tuple[str, ...], known: tuple[str, ...], message: str) -> None:
+    if set(names) - set(known):
+        warnings.warn(message, stacklevel=4)
 
 
 def _name(effect: Effect, parameter: str) -> str:

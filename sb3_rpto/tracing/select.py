@@ -11,7 +11,7 @@ from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
-from sb3_rpto.tracing.identify import Fit, Problem
+from sb3_rpto.tracing.identify import Fit, Linear, Problem
 from sb3_rpto.tracing.windows import Windows
 
 #: t*, well above what complete sets need to have nothing named (`benchmark threshold`: at most 2.0 in 30, most 0), as
@@ -344,10 +344,7 @@ class Selector:
     def promise(self, model: Model, effects: Sequence[int]) -> float:
         """Share of the error that a model would save with all of some effects, if the cost were quadratic."""
         free = self.free([*effects, *model.effects])
-        linear = self.train.linear(model.fit, free)
-        normal, gradient = linear.normal.sum(0), linear.gradient.sum(0)
-        ridge = 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(free))
-        saved = float(gradient @ np.linalg.solve(normal + ridge, gradient)) / model.fit.cost
+        saved = _fall(self.train.linear(model.fit, free), np.arange(len(free))) / model.fit.cost
         return 1 - float(np.sqrt(max(0.0, 1 - saved)))
 
     def promising(self, model: Model, outside: Sequence[int]) -> list[tuple[int, Fit]]:
@@ -374,12 +371,8 @@ class Selector:
         """The effects outside that promise most to first order, and those that may promise more with another shape."""
         every = self.free([*kept, *outside])
         linear = part.linear(base, every)
-        normal, gradient = linear.normal.sum(0), linear.gradient.sum(0)
-        normal = normal + 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(every))
-        falls = {}
-        for e in outside:
-            rows = np.flatnonzero(np.isin(every, self.free([*kept, e])))
-            falls[e] = float(gradient[rows] @ np.linalg.solve(normal[np.ix_(rows, rows)], gradient[rows]))
+        rows = {e: np.flatnonzero(np.isin(every, self.free([*kept, e]))) for e in outside}
+        falls = {e: _fall(linear, rows[e]) for e in outside}
         best = sorted(outside, key=lambda e: -falls[e])[:QUICK]
         return [e for e in outside if e in best or any(p.starts for p in self.simulation.effects[e].parameters)]
 
@@ -392,6 +385,13 @@ class Selector:
                 found.append(values.copy())
                 found[-1][i] = start
         return found
+
+
+def _fall(linear: Linear, rows: np.ndarray) -> float:
+    """How far the cost would fall by some of the free parameters if it were quadratic."""
+    normal, gradient = linear.normal.sum(0)[np.ix_(rows, rows)], linear.gradient.sum(0)[rows]
+    ridge = 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(rows))
+    return float(gradient @ np.linalg.solve(normal + ridge, gradient))
 
 
 def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:
