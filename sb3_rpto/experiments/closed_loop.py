@@ -15,7 +15,9 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch as th
+from gymnasium import spaces
 
+from sb3_rpto.dynamics.physical import PhysicalDynamics, physical_config
 from sb3_rpto.effects import LIBRARY, Declared, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments import sources
@@ -181,21 +183,31 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
         every=points,
         seed=job.seed,
         n_episodes=episodes,
-        read=partial(_read, truth),
+        read=partial(_read, job.task, truth),
         **kwargs,
     )
     write_atomically(path, json.dumps([{**row, **asdict(job)} for row in rows], indent=1) + "\n")
     return path
 
 
-def _read(truth: dict[str, float], model: Any) -> dict[str, Any]:
-    """The model's error on D_target, phi's error, and what was traced so far."""
+@cache
+def uncorrected(task: str) -> PhysicalDynamics:
+    """The source's simulator as it is."""
+    env = make_source(task)
+    assert isinstance(env.observation_space, spaces.Box)
+    assert isinstance(env.action_space, spaces.Box)
+    return PhysicalDynamics(env.observation_space, env.action_space, threads=1, **physical_config(env))
+
+
+def _read(task: str, truth: dict[str, float], model: Any) -> dict[str, Any]:
+    """One-step errors on D_target of the uncorrected simulator and the model, phi's error, what was traced so far."""
     dynamics = getattr(model, "dynamics", None)
     if dynamics is None:
         return {}
     row: dict[str, Any] = {}
     if model.replay_buffer.target.size() > 1:
-        row["model_error"] = float(dynamics.error(model.transitions("target")))
+        data = model.transitions("target")
+        row |= {"source_error": uncorrected(task).error(data), "model_error": dynamics.error(data)}
     known = dynamics.describe()
     off = [abs(known[name] / value - 1) for name, value in truth.items() if name in known]
     if off:
@@ -242,7 +254,7 @@ def summary(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float]) -> p
     :param rows: of :func:`collected`
     :param oracles: return of the oracle of each (task, shift, target)
     :return: IQM of the return with its 95 % interval, of the share of the oracle's, runs, updates and source steps per
-        target step, seconds, median model and parameter errors, verdicts
+        target step, seconds, median errors of the source, the model and its parameters, verdicts
     """
     best = pd.Series([oracles.get(key, np.nan) for key in zip(rows.task, rows["shift"], rows.target)], rows.index)
     rows = rows.assign(share=rows["return"] / best)
@@ -254,7 +266,7 @@ def summary(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float]) -> p
         line |= {"runs": len(part), "iqm": middle, "low": low, "high": high, "share": part["share"].mean()}
         line |= {f"{n}_per_step": part[n].mean() / steps for n in ("updates", "source_steps")}
         line["seconds"] = part["seconds"].mean()
-        for name in ("model_error", "parameter_error"):
+        for name in ("source_error", "model_error", "parameter_error"):
             line[name] = part[name].median() if name in part else np.nan
         verdicts = part["verdict"].dropna() if "verdict" in part else pd.Series(dtype=str)
         line["verdicts"] = ", ".join(f"{n}× {v}" for v, n in verdicts.value_counts().items())

@@ -9,7 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
+import torch as th
 
+from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.effects import Declared
 from sb3_rpto.experiments import closed_loop as study
 
@@ -55,6 +57,22 @@ def test_an_unfinished_study_is_a_fair_sample() -> None:
 def test_unknown_names_are_refused() -> None:
     with pytest.raises(ValueError, match=r"tasks.*ant"):
         study.jobs(["ant"], ["none"], [0], [0])
+
+
+def test_the_uncorrected_simulator_errs_on_shifted_targets_alone() -> None:
+    errors = {}
+    for shift in study.SHIFTS:
+        env = study.make_target("double-pendulum", shift, 0)
+        env.action_space.seed(0)
+        seen, steps = env.reset(seed=0)[0], []
+        for _ in range(5):
+            action = env.action_space.sample()
+            after, reward, *_ = env.step(action)
+            steps.append((seen, action, reward, after, 0.0))
+            seen = after
+        data = Transitions(*(th.as_tensor(np.array(column), dtype=th.float64) for column in zip(*steps)))
+        errors[shift] = study.uncorrected("double-pendulum").error(data)
+    assert errors["none"] < 1e-4 < 0.01 < min(errors["declared"], errors["undeclared"])
 
 
 def rows() -> pd.DataFrame:
