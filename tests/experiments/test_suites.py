@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from functools import partial
 from itertools import combinations, product
@@ -78,7 +79,9 @@ def test_paper_is_five_tasks_four_targets_four_seeds_all_methods() -> None:
         assert {v.method for v in place.variants} == set(REGISTRY) - {"oracle"}
     settings = {(p.task, v.label): v.settings for p in PAPER.places for v in p.variants}
     assert settings["Swimmer", "rpto-ensemble"]["preset"] == "paper"
-    assert settings["Ant", "sac-warm-high"]["gradient_steps"] == 5  # RPTO's number in the paper
+    assert settings["Ant", "sac-warm-high"] == {"gradient_steps": 5, "n_critics": 10}  # RPTO's number in the paper
+    runs = [(p.task, v.method, json.dumps(v.settings, sort_keys=True)) for p in PAPER.places for v in p.variants]
+    assert len(set(runs)) == len(runs)  # none is another over again
     assert settings["Swimmer", "sac"]["gamma"] == 0.9999
 
 
