@@ -198,13 +198,15 @@ class SimulatorSource(EpisodeSource):
         """Where the episodes stand, the simulators included."""
         phis = [[effect.values for effect in copy.effects] for copy in self.copies]
         inner = {"simulators": save_state(self.env.unwrapped), "phis": phis, "phi": self._phi}
-        return {**super().get_state(), **inner, "rng": self._rng.bit_generator.state}
+        streams = {"rng": self._rng.bit_generator.state, "seeds": self.dynamics.generator.get_state()}
+        return {**super().get_state(), **inner, **streams}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Continue where :meth:`get_state` was called; episodes begin anew where the simulators cannot be restored."""
         for copy, values in zip(self.copies, state["phis"]):
             copy.set_effects([e.with_values(v) for e, v in zip(self.dynamics.effects(), values)])
         self._phi, self._rng.bit_generator.state = state["phi"], state["rng"]
+        self.dynamics.generator.set_state(state["seeds"])  # this source was built anew, and drew some
         if state["simulators"] is not None:
             restore_state(self.env.unwrapped, state["simulators"])
             super().set_state(state)

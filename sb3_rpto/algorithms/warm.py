@@ -148,7 +148,8 @@ def begin_in_source(model: Resumable, source_timesteps: int, progress_bar: bool)
         model.take_snapshot("source")
     # A network must be fitted to describe the source; a physical model comes with the source's constants.
     learned = model.dynamics if model.dynamics is not None and model.dynamics.rollout == "branches" else None
-    if len(buffer.source_starts) == 0:  # neither source_data nor an earlier run gave any
+    # Neither source_data nor an earlier run gave any. A run that goes on keeps what a closed loop left it.
+    if len(buffer.source_starts) == 0 and (model.num_timesteps == 0 or buffer.source.size() == 0):
         wanted = PHI_0_STEPS if learned is not None else min(FIRST_SOURCE_STEPS, model.buffer_size)
         buffer.resize_source(max(buffer.source.buffer_size, wanted))
         _collect_in_source(model, wanted - buffer.source.size())

@@ -21,7 +21,9 @@ from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.buffers import chronological
 from sb3_rpto.callbacks import KeepBest
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
+from sb3_rpto.effects import declare
 from sb3_rpto.effects.model import numbers
+from sb3_rpto.envs.corrected import apply_effects
 
 
 def assert_same(a, b):
@@ -55,6 +57,11 @@ def double_pendulum():
     return gym.make("InvertedDoublePendulum-v5")
 
 
+def long_pole():
+    env = double_pendulum()
+    return apply_effects(env, [d.with_values(1.2 * d.values) for d in declare(env.unwrapped.model, ["pole.length"])])
+
+
 def hopper(gravity: float = -9.81):
     env = gym.make("Hopper-v5")
     env.unwrapped.model.opt.gravity[2] = gravity
@@ -67,6 +74,24 @@ CASES = {
     "rpto-pendulum": (RPTO, pendulum, lambda: pendulum(12.0), {}),
     "rpo-mujoco": (RPO, hopper, lambda: hopper(-12.0), {}),
     "rpto-physical": (RPTO, cartpole, lambda: cartpole(pole_length=2.0), {"dynamics": "physical"}),
+    "rpto-physical-mujoco": (
+        RPTO,
+        double_pendulum,
+        long_pole,
+        {
+            **{"dynamics": "physical", "declared": ["pole.length"], "model_train_freq": 40},
+            "dynamics_kwargs": {"randomise": 1.0, "threads": 1},
+        },
+    ),
+    "rpto-residual": (
+        RPTO,
+        double_pendulum,
+        long_pole,
+        {
+            **{"dynamics": "residual", "declared": ["cart.mass"], "model_train_freq": 40},
+            "dynamics_kwargs": {"ensemble_kwargs": SMALL_ENSEMBLE, "threads": 1},
+        },
+    ),
     "rpto-gsde": (RPTO, pendulum, lambda: pendulum(12.0), {"use_sde": True}),
     "rpo-normalised": (
         RPO,

@@ -128,6 +128,28 @@ def test_the_corrected_simulator_comes_back_from_a_checkpoint(tmp_path: Path) ->
     assert loaded.loop.found[0]["verdict"] == "explained"
 
 
+@pytest.mark.parametrize("stop", [60, 90], ids=["before the trace", "after it"])
+def test_a_loop_that_was_stopped_goes_on_as_if_it_had_not_been(stop: int, soon: None, tmp_path: Path) -> None:
+    def begun() -> RPTO:
+        return model(friction()).learn(stop, source_timesteps=100)
+
+    unbroken = begun().learn(100 - stop, reset_num_timesteps=False)
+    stopped = begun()
+    stopped.save(tmp_path / "model")
+    stopped.save_replay_buffer(tmp_path / "buffer")
+    resumed = RPTO.load(tmp_path / "model", env=gym.make(TASK), target_env=target(friction()), device="cpu")
+    resumed.load_replay_buffer(tmp_path / "buffer")
+    resumed.learn(100 - stop, reset_num_timesteps=False)
+    assert resumed.loop is not None
+    assert unbroken.loop is not None
+    assert resumed.loop.found == unbroken.loop.found
+    assert "coulomb_friction(slider).level" in dynamics(resumed).names
+    np.testing.assert_array_equal(dynamics(resumed).values, dynamics(unbroken).values)
+    assert resumed.source_timesteps == unbroken.source_timesteps
+    for ours, theirs in zip(resumed.policy.parameters(), unbroken.policy.parameters()):
+        assert th.equal(ours, theirs)
+
+
 def test_a_learned_model_predicts_the_target() -> None:
     made = learned()
     assert dynamics(made).error(made.transitions("target")) < 1e-3
