@@ -67,6 +67,8 @@ class DualReplayBuffer(ReplayBuffer):
         self._make_side = partial(side_class, observation_space=observation_space, action_space=action_space, **kwargs)
         self.source = self._make_side(buffer_size=buffer_size, device=device)
         self.target = self._make_side(buffer_size=target_size, device=device)
+        #: transitions that were ever added to the target side, those that it forgot included
+        self.target_added = 0
         #: observations of the real source environment, from which model branches may start; (n, observation_dim)
         self.source_starts = np.empty((0, *observation_space.shape), dtype=observation_space.dtype)
         # BaseBuffer alone: ReplayBuffer's constructor would allocate a third set of arrays.
@@ -167,6 +169,7 @@ class DualReplayBuffer(ReplayBuffer):
         """
         side = self.side(world)
         n = len(rewards)
+        self.target_added += n if world == "target" else 0
         timeouts = np.zeros(n, dtype=bool) if timeouts is None else timeouts
         actions = actions.reshape(n, -1)
         if type(side).add is not ReplayBuffer.add or n > side.buffer_size:  # a class of the user's sees every row

@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import (
     ProgressBarCallback,
     StopTrainingOnMaxEpisodes,
 )
+from stable_baselines3.common.logger import HumanOutputFormat, Logger
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
@@ -45,6 +46,8 @@ DYNAMICS_SEED_OFFSET = 20_000
 RECENT_EPISODES = 5
 #: What SB3's collection knows of a step when it calls back, before it stores the transition.
 STEP = ("buffer_actions", "new_obs", "rewards", "dones", "infos")
+#: Characters that a key may have in the table that SB3 prints: names of effects are long.
+LONGEST_KEY = 120
 
 
 class RuleOfEnvironment:
@@ -129,6 +132,8 @@ class TwoWorlds(PolicySnapshots):
                     stacklevel=2,
                 )
                 self.replay_buffer.target.reset()
+            if self._resume_state is not None:  # where that target stood, and a step of it that is not stored
+                self._resume_state |= {"target": None, "last_obs": None, "unstored_step": None}
         self._bind_rules(venv, of_target=True)
         self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
         self._offline = self._traces_log = False
@@ -231,6 +236,7 @@ class TwoWorlds(PolicySnapshots):
             )
         finally:
             self.action_noise = noise
+        _make_room_for_names(self.logger)
         if starts_episode:
             self._source_world, self._source_first_obs = None, self._last_obs  # SB3 has just reset the source
             if noise is not None and self._resume_state is None:
@@ -245,8 +251,11 @@ class TwoWorlds(PolicySnapshots):
         """Reset the target and what SB3 keeps of it."""
         assert self.target_env is not None  # learn() has checked
         n_envs, noise = self.target_env.num_envs, self.action_noise
-        if noise is not None and n_envs > 1 and not isinstance(noise, VectorizedActionNoise):
-            self.action_noise = VectorizedActionNoise(noise, n_envs)
+        if noise is not None and n_envs != getattr(
+            noise, "n_envs", 1
+        ):  # also where the last target was of another width
+            single = noise.base_noise if isinstance(noise, VectorizedActionNoise) else noise
+            self.action_noise = single if n_envs == 1 else VectorizedActionNoise(single, n_envs)
         self._last_obs = np.asarray(self.target_env.reset())
         self._last_episode_starts = np.ones(n_envs, dtype=bool)
         normaliser = unwrap_vec_normalize(self.target_env)
@@ -356,6 +365,11 @@ class TwoWorlds(PolicySnapshots):
             if self.action_noise is not None:
                 self.action_noise.reset(**({"indices": [i]} if len(step["dones"]) > 1 else {}))
 
+    def _store_step_cut_off(self) -> None:
+        """Store the target step in whose callback an exception ended the last run, for a run that goes on."""
+        if self.target_env is not None and self._callback is not None and find_ledger(self.target_env).unstored:
+            self.store_step(self._callback.locals)
+
     def _count_source_steps(self, callback: BaseCallback) -> bool:
         """What stands in for a target step when the target is a log: ``num_timesteps`` counts source steps."""
         self.num_timesteps += min(int(self.source_steps), self._steps_left())
@@ -394,6 +408,13 @@ class TargetProgressBar(ProgressBarCallback):
     def _on_step(self) -> bool:
         self.pbar.update(self.model.num_timesteps - self.model._num_timesteps_at_start - self.pbar.n)
         return True
+
+
+def _make_room_for_names(logger: Logger) -> None:
+    """SB3's table cuts keys at 36 characters and refuses two that are the same then, as names of effects may be."""
+    for output in logger.output_formats:
+        if isinstance(output, HumanOutputFormat):
+            output.max_length = max(output.max_length, LONGEST_KEY)
 
 
 def _flatten(callback: BaseCallback) -> list[BaseCallback]:

@@ -39,6 +39,10 @@ NOT_SAVED = (
 )
 
 
+#: What a VecNormalize keeps of the last step as it was.
+RAW = ("old_obs", "old_reward")
+
+
 class Resumable(TwoWorlds):
     """A complete checkpoint: SB3's zip with the dynamics, and where both worlds and the random streams stand."""
 
@@ -166,38 +170,26 @@ def _unstored_step(model: Resumable) -> dict[str, Any] | None:
     if model.target_env is None or model._callback is None or not find_ledger(model.target_env).unstored:
         return None
     normaliser = unwrap_vec_normalize(model.target_env)
-    raw = None if normaliser is None else {"old_obs": normaliser.old_obs, "old_reward": normaliser.old_reward}
+    raw = None if normaliser is None else {name: getattr(normaliser, name) for name in RAW}
     return {"raw": raw, "known": {name: model._callback.locals[name] for name in STEP}}
 
 
-def resume(model: Resumable) -> bool:
+def resume(model: Resumable) -> None:
     """Put the worlds and the random streams back to where the loaded checkpoint left them.
 
     A world that cannot be put back begins a new episode, and a warning says which.
-
-    :return: whether the checkpoint was written between a target step and the update after it
     """
     state, model._resume_state = model._resume_state, None
     if state is None:
-        return False
+        return
     assert model.env is not None  # learn() has checked both worlds
-    restarted, inside = [], False
+    restarted = []
     if not _put_back(model.env, state["source"]):
         restarted.append("source")
     elif state["source_world"] is not None and model._source_world is not None:
         model._source_world.set_state(state["source_world"])
-    if not model._offline:
-        assert model.target_env is not None
-        if state["last_obs"] is None or not _put_back(find_ledger(model.target_env).venv, state["target"]):
-            restarted.append("target")
-        else:
-            model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
-            if state["unstored_step"] is not None:
-                inside = True
-                normaliser = unwrap_vec_normalize(model.target_env)
-                if normaliser is not None:
-                    vars(normaliser).update(state["unstored_step"]["raw"])
-                model.store_step(state["unstored_step"]["known"])
+    if not model._offline and state["last_obs"] is not None and not _put_target_back(model, state):
+        restarted.append("target")
     if restarted:
         warnings.warn(
             f"the {' and the '.join(restarted)} environment cannot restore its state: it begins a new episode, "
@@ -205,10 +197,43 @@ def resume(model: Resumable) -> bool:
             "when the checkpoint was saved, and can save its state)",
             stacklevel=3,
         )
+    _restore_streams(state)
+
+
+def resume_source_phase(model: Resumable) -> None:
+    """Go on with the statistics and random streams of a checkpoint of the source phase, in a new episode."""
+    state, model._resume_state = model._resume_state, None
+    if state is None:
+        return
+    assert model.env is not None  # learn() has checked
+    _put_back(model.env, state["source"])
+    model._source_first_obs = np.asarray(model.env.reset())
+    _restore_streams(state)
+
+
+def _restore_streams(state: dict[str, Any]) -> None:
     random.setstate(state["random"])
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
-    return inside
+
+
+def _put_target_back(model: Resumable, state: dict[str, Any]) -> bool:
+    """Restore the target, and store the step that the checkpoint carries; False where a new episode begins after it."""
+    assert model.target_env is not None
+    normaliser = unwrap_vec_normalize(model.target_env)
+    raw = {} if normaliser is None else {name: getattr(normaliser, name) for name in RAW}
+    begun = model._last_obs, model._last_original_obs, raw
+    restored = _put_back(find_ledger(model.target_env).venv, state["target"])
+    model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
+    if state["unstored_step"] is not None:
+        if normaliser is not None:
+            vars(normaliser).update(state["unstored_step"]["raw"])
+        model.store_step(state["unstored_step"]["known"])
+    if not restored:
+        model._last_obs, model._last_original_obs, raw = begun
+        if normaliser is not None:
+            vars(normaliser).update(raw)
+    return restored
 
 
 def _put_back(env: VecEnv, state: dict[str, Any] | None) -> bool:

@@ -56,9 +56,10 @@ class LoopCloser:
         #: of this process; a checkpoint keeps what they said, :attr:`found`
         self.reports: list[Report] = []
         self.found: list[dict[str, Any]] = []
-        self._traced_at = 0
+        #: transitions of the target that were ever added before the last trace
+        self._traced_at: int | None = None
         self._error = math.inf
-        #: whether D_source holds what an uncorrected source produced
+        #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
         self.stale = False
 
     def __getstate__(self) -> dict[str, Any]:
@@ -66,17 +67,20 @@ class LoopCloser:
 
     def forget_target(self) -> None:
         """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""
-        self._traced_at, self._error = 0, math.inf
+        self._traced_at, self._error = None, math.inf
 
     def due(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
         """Whether enough was seen for a first trace, or what is new is no longer predicted."""
-        size = model.replay_buffer.target.size()
-        if not self._traced_at:
-            return size >= FIRST
-        if size - self._traced_at < AGAIN:
+        buffer = model.replay_buffer
+        size, capacity = buffer.target.size(), buffer.target.buffer_size
+        if self._traced_at is None:
+            return size >= min(FIRST, capacity)
+        if buffer.target_added < self._traced_at:  # loaded without its buffer
+            self._traced_at = 0
+        new = min(buffer.target_added - self._traced_at, size)
+        if new < min(AGAIN, capacity):
             return False
-        new = model.transitions("target").take(slice(self._traced_at, None))
-        return dynamics.error(new) > RISEN * self._error
+        return dynamics.error(model.transitions("target").take(slice(size - new, None))) > RISEN * self._error
 
     def close(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:
         """Trace on D_target, keep what lowers the error, log it, and renew D_source where another simulator made it."""
@@ -86,13 +90,12 @@ class LoopCloser:
         measured = Measurements.from_replay(model.replay_buffer, model.env)
         horizon = (WINDOW - 1) * float(single_env(model.env).unwrapped.dt)  # type: ignore[attr-defined]
         report = self._trace(model, dynamics, measured, horizon)
-        self._traced_at = len(data)
+        self._traced_at = model.replay_buffer.target_added
         added = self._take(model, dynamics, report, data, before)
         self._error = dynamics.error(data)
         _say(model, report, added, f"{len(data)} target transitions", before, self._error)
-        if added or outdated(model, dynamics):
-            renew_source(model)
-            learn_in_source(model)
+        self.stale = bool(added) or outdated(model, dynamics)
+        self.renew(model)
 
     def close_on_log(self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements) -> None:
         """Trace on a robot's log itself, by multiple shooting: one-step errors of noisy samples tell next to nothing.
@@ -106,14 +109,19 @@ class LoopCloser:
         report = self._trace(model, dynamics, measured, None)
         added = self._take(model, dynamics, report, data, math.inf)
         warm.fill_recorded(model, measured, dynamics.effects())
-        self.stale = True
+        self.stale = model.replay_buffer.source.size() > 0 or not model._warm
         _say(model, report, added, f"{len(measured.episodes)} recorded episodes", before, dynamics.error(data))
 
     def renew(self, model: TransferAlgorithm) -> None:
-        """Drop what is :attr:`stale`, if anything is; a budget of source steps is for the loop to learn on."""
+        """Drop what is :attr:`stale`, if anything is, and learn anew; a budget of source steps learns by itself.
+
+        Where that is interrupted it is done when the run goes on.
+        """
         if self.stale:
-            self.stale = False
             renew_source(model)
+            if not model._offline:
+                learn_in_source(model)
+            self.stale = False
 
     def _trace(
         self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements, horizon: float | None
@@ -142,6 +150,9 @@ class LoopCloser:
     ) -> list[str]:
         """Let phi have the effects that were found, if that pays; the labels of those that are new.
 
+        A trace begins at the bare simulator: what it found is the whole explanation, so what an earlier one had found
+        and this one has not leaves phi.
+
         :param before: error of ``data`` without them; infinite: the report judges
         """
         known = {effect.label for effect in dynamics.effects()}
@@ -151,6 +162,8 @@ class LoopCloser:
         if before == math.inf and new and not explains_more(report):
             return []
         kept = dynamics.effects(), dynamics.deviations()
+        declared = [effect for effect in dynamics.effects() if isinstance(effect, Declared)]
+        dynamics.replace(declared, dynamics.deviations())
         dynamics.adopt(found, {traced.label: deviation_of(traced) for traced in all_traced})
         assert model.env is not None
         if not stays_finite(dynamics, data, model.env):
@@ -254,6 +267,7 @@ def learn_in_source(model: TransferAlgorithm) -> None:
             if model.use_sde:
                 model.actor.reset_noise()
             taken = source.interact(model, int(model.source_steps))
+            model.source_timesteps += taken
             model.train(round(taken * updates_per_step), model.batch_size)
             steps += taken
         # Where no episode ended there is nothing to judge by, and learning goes on.
@@ -262,4 +276,3 @@ def learn_in_source(model: TransferAlgorithm) -> None:
             print(f"learning in the corrected simulator: {steps} source steps, mean return {earned:.5g}")
         idle = 0 if earned > best else idle + 1
         best = max(best, earned) if source.returns else best
-    model.source_timesteps += steps

@@ -77,6 +77,8 @@ class TransferAlgorithm(Resumable):
     _passed: frozenset[str]
     #: ``num_timesteps`` where the target rollout under way began
     _rollout_began_at: int
+    #: step 3 of a round is done, its steps 5 and 6 are not
+    _round_open: bool
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         """Remember which arguments the user passed: a preset fills in only the others."""
@@ -199,6 +201,7 @@ class TransferAlgorithm(Resumable):
         self._collected = 1
         self._since_fit = 0
         self._rollout_began_at = 0
+        self._round_open = False
         self._source_world = None
         self._source_first_obs = None
         self._null_check = None
@@ -345,31 +348,53 @@ class TransferAlgorithm(Resumable):
         arguments.check_ready(self, total_timesteps, source_timesteps)
         if source_timesteps is None:
             source_timesteps = min(10 * total_timesteps, 300_000)
-        if reset_num_timesteps:
+        if not reset_num_timesteps:
+            self._store_step_cut_off()
+        elif self._warm:  # else the source phase goes on all the same
             self._resume_state = None
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         self._source_world = self._source_world or self._make_source_world()
         self._trace_log()  # first of all: the log may be refused
+        if not self._warm:
+            checkpoint.resume_source_phase(self)
         self.begin_in_source(source_timesteps, progress_bar)
-        inside_rollout = checkpoint.resume(self)
+        checkpoint.resume(self)
         if self.loop is not None:
             self.loop.renew(self)
         self._watch_for_null_shift()
         self._callback = callback
         callback.on_training_start(locals(), globals())
-        if inside_rollout:  # a callback's checkpoint: steps 3 and 4 were done, steps 5 and 6 were not
-            self._collected = self.num_timesteps - self._rollout_began_at
-            self.update()
+        self._finish_open_round(forget=reset_num_timesteps)
         while self._steps_left() > 0:
-            self.interact_with_source()  # step 3
+            if not self._round_open:
+                self.interact_with_source()  # step 3
+            self._round_open = True
             if not self.interact_with_target(callback, log_interval):  # step 4
                 break
-            self.update()  # steps 5 and 6
+            self._end_round()
         callback.on_training_end()
         self._callback = None
         return self
+
+    def _end_round(self) -> None:
+        self.update()  # steps 5 and 6
+        self._round_open = False
+
+    def _finish_open_round(self, forget: bool) -> None:
+        """Make up for the steps 5 and 6 before which the last run was stopped or saved; step 3 is not done twice.
+
+        :param forget: a new run begins, and owes nothing
+        """
+        self._round_open &= not forget
+        if self._round_open and not self._offline:
+            taken = self.num_timesteps - self._rollout_began_at
+            if not taken:
+                return
+            self._collected = taken
+        if self._round_open:
+            self._end_round()
 
     def begin_in_source(self, source_timesteps: int, progress_bar: bool) -> None:
         """What Algorithm 1 takes as its input: a policy, its critic and phi_0 that know the source.
@@ -421,13 +446,18 @@ class TransferAlgorithm(Resumable):
 
     def _trace_log(self) -> None:
         """Once, before anything is learned: phi from a trace of the robot's log, where one was given."""
-        if self._traces_log and self.loop is not None and not self.loop.found:
-            assert isinstance(self.dynamics, PhysicalDynamics)  # else there is nothing to trace for
-            if self.measured is None:
-                raise ValueError(
-                    "this model was saved before its recordings were traced, and a checkpoint does not hold them: set "
-                    "model.measured = Measurements.from_csv(...) again"
-                )
+        if not self._traces_log or self.loop is None or (self.loop.found and self.replay_buffer.target.size() > 0):
+            return
+        assert isinstance(self.dynamics, PhysicalDynamics)  # else there is nothing to trace for
+        if self.measured is None:
+            raise ValueError(
+                "this model was saved before its recordings were traced, or is loaded without its buffers, and a "
+                "checkpoint does not hold them: load_replay_buffer(), or set model.measured = "
+                "Measurements.from_csv(...) again"
+            )
+        if self.loop.found:
+            warm.fill_recorded(self, self.measured, self.dynamics.effects())
+        else:
             self.loop.close_on_log(self, self.dynamics, self.measured)
 
     def _close_the_loop(self) -> None:

@@ -1,9 +1,12 @@
 """SB3's accounts in the target: rollouts of whole episodes, the null-shift check."""
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from conftest import ALGORITHMS, small
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_rpto import RPO
 
@@ -75,3 +78,14 @@ def test_the_null_shift_check_ends():
     model = small(RPO, short(10.0), short(12.0))
     model.learn(3, source_timesteps=0)
     assert model._null_check is None
+
+
+@pytest.mark.parametrize("widths", [(2, 1), (1, 2), (2, 3)])
+def test_action_noise_takes_the_width_of_the_target(widths):
+    first, second = ([short] * width for width in widths)
+    model = small(RPO, target=DummyVecEnv(first), action_noise=NormalActionNoise(np.zeros(1), np.full(1, 0.1)))
+    model.learn(12, source_timesteps=0)
+    with pytest.warns(UserWarning, match="D_target loses"):
+        model.set_target_env(DummyVecEnv(second))
+    model.learn(12, reset_num_timesteps=False)
+    assert model.num_timesteps == 24

@@ -1,5 +1,6 @@
 """A checkpoint is complete: resuming equals not having stopped."""
 
+import contextlib
 import threading
 
 import gymnasium as gym
@@ -8,7 +9,7 @@ import pytest
 import torch as th
 from conftest import ALGORITHMS, SMALL_ENSEMBLE, SMALL_POLICY, pendulum, small
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
@@ -233,6 +234,125 @@ def test_a_killed_source_phase_goes_on_from_its_checkpoint(tmp_path):
     assert resumed.replay_buffer.source.size() == done
     resumed.learn(5, source_timesteps=300)
     assert resumed._pretrained_steps == 300
+
+
+def test_a_source_phase_goes_on_with_its_statistics(tmp_path, monkeypatch):
+    def source():
+        return VecNormalize(make_vec_env(pendulum, seed=3))
+
+    model = small(RPO, source())
+    model.set_logger(configure(str(tmp_path), []))
+    train = warm._train_in_source
+    monkeypatch.setattr(warm, "_train_in_source", lambda model, steps, bar: train(model, steps // 2, bar))
+    model.learn(5, source_timesteps=300)
+    counted = model.env.obs_rms.count
+    monkeypatch.undo()
+    resumed = RPO.load(tmp_path / "pretrain.zip", env=source(), target_env=pendulum(12.0))
+    resumed.load_replay_buffer(tmp_path / "pretrain_replay_buffer.pkl")
+    assert resumed._pretrained_steps == 150
+    resumed.learn(5, source_timesteps=300)
+    assert resumed.env.obs_rms.count > counted + 140
+
+
+class SaveAt(BaseCallback):
+    """Save in a hook at a step."""
+
+    def __init__(self, hook, step, path):
+        super().__init__()
+        self.hook, self.step, self.path = hook, step, path
+
+    def _save(self, hook):
+        if hook == self.hook and self.model.num_timesteps == self.step:
+            self.model.save(self.path / "model")
+            self.model.save_replay_buffer(self.path / "buffer")
+
+    def _on_rollout_start(self):
+        self._save("start")
+
+    def _on_step(self):
+        self._save("step")
+        return True
+
+    def _on_rollout_end(self):
+        self._save("end")
+
+
+@pytest.mark.parametrize("hook", ["start", "step", "end"])
+def test_a_checkpoint_of_any_hook_resumes_as_if_never_stopped(hook, tmp_path):
+    unbroken = small(RPO).learn(40, SaveAt(hook, 20, tmp_path), source_timesteps=0)
+    resumed = RPO.load(tmp_path / "model", env=pendulum(), target_env=pendulum(12.0), device="cpu")
+    resumed.load_replay_buffer(tmp_path / "buffer")
+    assert_same(unbroken, resumed.learn(20, reset_num_timesteps=False))
+
+
+def test_a_checkpoint_of_a_run_on_recordings_resumes_as_if_never_stopped(tmp_path):
+    recorded = SAC("MlpPolicy", pendulum(12.0), learning_starts=100, seed=0, device="cpu").learn(60).replay_buffer
+    settings = {"policy_kwargs": SMALL_POLICY, "batch_size": 32, "source_steps": 8, "gradient_steps": 2, "seed": 0}
+    few = {"dynamics_kwargs": SMALL_ENSEMBLE, "model_train_freq": 7, "device": "cpu"}
+    unbroken = RPTO("MlpPolicy", pendulum(), target_data=recorded, **settings, **few)
+    unbroken.learn(160, SaveAt("step", 80, tmp_path), source_timesteps=0)
+    resumed = RPTO.load(tmp_path / "model", env=pendulum(), device="cpu")
+    resumed.load_replay_buffer(tmp_path / "buffer")
+    assert_same(unbroken, resumed.learn(80, reset_num_timesteps=False))
+
+
+class Stop(BaseCallback):
+    def __init__(self, step, error=None):
+        super().__init__()
+        self.step, self.error = step, error
+
+    def _on_step(self):
+        if self.num_timesteps == self.step and self.error is not None:
+            raise self.error
+        return self.num_timesteps != self.step
+
+
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt()], ids=["returns False", "raises"])
+def test_a_run_that_a_callback_ended_goes_on_without_a_loss(error):
+    unbroken = small(RPO).learn(40, source_timesteps=0)
+    stopped = small(RPO)
+    with pytest.raises(KeyboardInterrupt) if error else contextlib.nullcontext():
+        stopped.learn(40, Stop(20, error), source_timesteps=0)
+    stopped.learn(20, reset_num_timesteps=False)
+    assert_same(unbroken, stopped)
+
+
+class Opaque(gym.Wrapper):
+    """Nobody knows how to save it."""
+
+    secret = 0
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.secret = 1
+
+
+def test_a_step_is_kept_where_the_target_cannot_be_put_back(tmp_path):
+    small(RPO, target=Opaque(pendulum(12.0))).learn(30, SaveAt("step", 20, tmp_path), source_timesteps=0)
+    resumed = RPO.load(tmp_path / "model", env=pendulum(), target_env=Opaque(pendulum(12.0)), device="cpu")
+    resumed.load_replay_buffer(tmp_path / "buffer")
+    assert resumed.replay_buffer.target.size() == 19
+    with pytest.warns(UserWarning, match="target environment cannot restore"):
+        resumed.learn(10, reset_num_timesteps=False)
+    assert resumed.replay_buffer.target.size() == resumed.num_timesteps == resumed._n_updates == 30
+    side = resumed.replay_buffer.target
+    assert not np.array_equal(side.next_observations[19], side.observations[20])  # a new episode
+
+
+def test_another_target_knows_nothing_of_where_the_last_one_stood(tmp_path):
+    small(RPO).learn(30, SaveAt("step", 20, tmp_path), source_timesteps=0)
+    resumed = RPO.load(tmp_path / "model", env=pendulum(), target_env=pendulum(12.0), device="cpu")
+    resumed.load_replay_buffer(tmp_path / "buffer")
+    resumed.set_target_env(pendulum(30.0))
+    resumed.learn(5, reset_num_timesteps=False)
+    side, twin = resumed.replay_buffer.target, pendulum(30.0).unwrapped
+    twin.reset(seed=0)
+    assert side.size() == 5
+    for i in range(5):
+        cosine, sine, speed = side.observations[i, 0]
+        twin.state = np.array([np.arctan2(sine, cosine), speed])
+        after, *_ = twin.step(2.0 * side.actions[i, 0])
+        np.testing.assert_allclose(after, side.next_observations[i, 0], atol=1e-3)
 
 
 def test_a_world_that_cannot_restore_its_state_says_so(tmp_path):

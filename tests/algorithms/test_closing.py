@@ -22,7 +22,7 @@ from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.tracing import Report, trace
+from sb3_rpto.tracing import Measurements, Report, trace
 
 TASK = "InvertedDoublePendulum-v5"
 KINDS = ["coulomb_friction", "torque_offset", "quadratic_drag"]
@@ -43,9 +43,10 @@ def model(lacks: list[Effect], **kwargs: object) -> RPTO:
     settings: dict[str, object] = {
         **{"dynamics": "physical", "declared": ["pole.length"], "close_loop": KINDS, "seed": 0, "device": "cpu"},
         **{"source_steps": 4, "gradient_steps": 1, "weighting": None, "model_train_freq": 40, "batch_size": 32},
+        **{"target_env": None if "target_data" in kwargs else target(lacks)},
         **kwargs,
     }
-    return RPTO("MlpPolicy", gym.make(TASK), target_env=target(lacks), **settings)  # type: ignore[arg-type]
+    return RPTO("MlpPolicy", gym.make(TASK), **settings)  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -155,9 +156,9 @@ def test_a_learned_model_predicts_the_target() -> None:
     assert dynamics(made).error(made.transitions("target")) < 1e-3
 
 
-def filled(lacks: list[Effect], count: int = 100) -> RPTO:
+def filled(lacks: list[Effect], count: int = 100, **kwargs: object) -> RPTO:
     """A model whose D_target holds random actions in the target, ready to close the loop."""
-    made = model(lacks)
+    made = model(lacks, **kwargs)
     made.learn(1, source_timesteps=0)
     append(made, lacks, count)
     return made
@@ -250,6 +251,106 @@ def test_a_new_target_is_traced_anew(soon: None) -> None:
     assert not made.loop.due(made, dynamics(made))
     append(made, lacks, 10)  # as many as a first trace takes
     assert made.loop.due(made, dynamics(made))
+
+
+def explanation(effects: list[Effect], verdict: str = "explained") -> SimpleNamespace:
+    """What a trace would report."""
+    traced = tuple(SimpleNamespace(effect=e, label=e.label, interval=np.stack([e.values, e.values])) for e in effects)
+    ratio = SimpleNamespace(ratio=1.0)
+    return SimpleNamespace(verdict=verdict, adequacy_before=ratio, adequacy_after=ratio, declared=(), effects=traced)
+
+
+def test_a_later_explanation_takes_the_place_of_an_earlier_one() -> None:
+    made = filled(friction())
+    assert made.loop is not None
+    data, phi = made.transitions("target"), dynamics(made)
+    phi.adopt([LIBRARY["viscous_friction"]("slider", coefficient=0.5)])
+    phi.fit(data, max_steps=30)
+    report = explanation([*phi.effects()[:1], *friction()])
+    added = made.loop._take(made, phi, report, data, phi.error(data))  # type: ignore[arg-type]
+    assert added == ["coulomb_friction(slider)"]
+    assert phi.names == ["pole.length", "coulomb_friction(slider).level"]
+
+
+@pytest.mark.parametrize("forgotten", ["the oldest", "all, for it was not loaded"])
+def test_another_trace_is_due_though_transitions_are_forgotten(
+    forgotten: str, soon: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(closing, "AGAIN", 20)
+    wide = None if forgotten.startswith("all") else {"target_size": 90}
+    made = filled(friction(), replay_buffer_kwargs=wide)
+    assert made.loop is not None
+    made.loop.close(made, dynamics(made))
+    if wide is None:
+        made.replay_buffer = model(friction()).replay_buffer
+    append(made, [LIBRARY["torque_offset"]("hinge", offset=2.0)], 19)
+    assert not made.loop.due(made, dynamics(made))
+    append(made, [LIBRARY["torque_offset"]("hinge", offset=2.0)], 11)
+    assert made.loop.due(made, dynamics(made))
+
+
+def test_a_small_memory_is_traced_when_it_is_full(soon: None) -> None:
+    made = filled(friction(), 48, replay_buffer_kwargs={"target_size": 50})
+    assert made.loop is not None
+    assert not made.loop.due(made, dynamics(made))
+    append(made, friction(), 1)
+    assert made.loop.due(made, dynamics(made))
+
+
+def test_learning_in_the_corrected_simulator_that_was_interrupted_is_counted_and_done_again(
+    soon: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = model(friction()).learn(60, source_timesteps=100)
+    train = made.train
+
+    def interrupted(steps: int, batch_size: int) -> None:
+        if made.loop is not None and made.loop.stale:
+            raise KeyboardInterrupt
+        train(steps, batch_size)
+
+    monkeypatch.setattr(made, "train", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        made.learn(40, reset_num_timesteps=False)
+    assert made.loop is not None
+    assert made.loop.found
+    assert made.loop.stale
+    before = made.source_timesteps
+    monkeypatch.undo()
+    monkeypatch.setattr(closing, "FRESH", 25)
+    monkeypatch.setattr(closing, "FILL", 25)
+    made.learn(1, reset_num_timesteps=False)
+    assert not made.loop.stale
+    assert made.source_timesteps >= before + 25 + 25
+
+
+def test_a_budget_of_source_steps_is_not_exceeded_by_the_loop(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = filled(friction()).replay_buffer
+    made = model([], target_data=recorded)
+    assert made.loop is not None
+    monkeypatch.setattr(made.loop, "_trace", lambda *_: explanation(friction()))
+    monkeypatch.setattr(closing, "learn_in_source", lambda _: pytest.fail("learns beyond the budget"))
+    made.learn(200, source_timesteps=0)
+    assert "coulomb_friction(slider).level" in dynamics(made).names
+
+
+def test_a_policy_that_knows_the_source_begins_in_the_corrected_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = Measurements.from_replay(filled(friction()).replay_buffer, gym.make(TASK))
+    made = model([], target_data=measured)
+    made._warm = True
+    assert made.loop is not None
+    monkeypatch.setattr(made.loop, "_trace", lambda *_: made.loop.found.append({}) or explanation(friction()))  # type: ignore[union-attr,func-returns-value]
+    monkeypatch.setattr(closing, "renew_source", lambda _: pytest.fail("drops what the corrected simulator produced"))
+    made.learn(8)
+    seen = made.replay_buffer.target.size()
+    made.replay_buffer.target.reset()  # as of a model that is loaded without its buffers
+    made.learn(8, reset_num_timesteps=False)
+    assert made.replay_buffer.target.size() == seen > 50
+
+
+def test_long_names_of_effects_are_logged(soon: None) -> None:
+    effects = [LIBRARY["viscous_friction"]("slider", coefficient=0.1).to_json()]
+    made = model([], dynamics_kwargs={"effects": effects}, close_loop=False, verbose=1, model_train_freq=5)
+    assert made.learn(12, log_interval=1, source_timesteps=0).num_timesteps == 12
 
 
 @pytest.mark.parametrize(
