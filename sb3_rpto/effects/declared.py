@@ -215,6 +215,16 @@ class Declared(Effect):
         return self.parameters[0].name
 
     @property
+    def scales(self) -> bool:
+        """Whether it acts as a factor on the nominal value, and so is never 0."""
+        return self._how.span is not None
+
+    @property
+    def number(self) -> tuple[str, int, str]:
+        """Which number of the model it is, by whatever name: object's kind, index, parameter."""
+        return self.owner, self.index, self.label.rpartition(".")[2]
+
+    @property
     def rank(self) -> int:
         """Its turn among declared parameters: what changes a mass or an inertia besides comes before these."""
         return {"mass": 1, "inertia": 2}.get(self.label.rpartition(".")[2], 0)
@@ -295,7 +305,7 @@ def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:
     """
     if isinstance(names, str):
         raise TypeError(f"declared must be a list of names, not the string {names!r}; write [{names!r}]")
-    found: dict[str, Declared] = {}
+    found: dict[tuple[str, int, str], Declared] = {}
     for entry in names:
         name, equals, given = entry.partition("=")
         bounds = _bounds(entry, given) if equals else None
@@ -306,7 +316,8 @@ def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:
             if not matches:
                 raise ValueError(f"declared {name!r} matches nothing; {near(name, parameter_names(model))}")
         for match in matches:
-            found[match] = Declared(model, match, bounds)
+            one = Declared(model, match, bounds)
+            found[one.number] = one
     return list(found.values())
 
 

@@ -15,14 +15,17 @@ import numpy as np
 from sb3_rpto.effects.wrapper import beyond_model
 
 #: what :func:`load_model` takes
-ModelSource: TypeAlias = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | gym.Env
+ModelSource: TypeAlias = (
+    str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | gym.Env | tuple[mujoco.MjSpec, mujoco.MjModel]
+)
 
 
 def load_model(source: ModelSource) -> tuple[mujoco.MjSpec | None, mujoco.MjModel]:
     """The compiled model that ``source`` holds, and the specification that it came from.
 
     :param source: the path of an MJCF file, MJCF text, an MjSpec, an MjModel, or a gymnasium MuJoCo environment, whose
-        model may have been changed since it was loaded. One whose MJCF is in no file tells it by a method ``mjcf()``
+        model may have been changed since it was loaded. One whose MJCF is in no file tells it by a method ``mjcf()``.
+        Or the pair that this returns, as it was then
     :return: a specification (None where nothing tells it: for an MjModel, and for an environment whose file compiles to
         a model of another layout) and a model; copies, the source is left alone
     :raises TypeError: none of these
@@ -32,6 +35,9 @@ def load_model(source: ModelSource) -> tuple[mujoco.MjSpec | None, mujoco.MjMode
     """
     if isinstance(source, mujoco.MjModel):
         return None, copy.copy(source)
+    if isinstance(source, tuple):
+        known, model = source
+        return known.copy(), copy.copy(model)
     if isinstance(source, mujoco.MjSpec):
         spec = source.copy()
         return spec, spec.compile()

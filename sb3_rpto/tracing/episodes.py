@@ -11,6 +11,8 @@ from sb3_rpto.tracing.columns import Columns, joint_of
 
 Table = Mapping[str, np.ndarray]
 PARTS = ("train", "select", "test")
+#: Times in s should be told as finely as this.
+FINEST = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,8 @@ def runs_of(file: str, table: Table) -> dict[str | None, dict[str, np.ndarray]]:
             if len(blank):
                 raise ValueError(f"{file}: column {name!r} is empty in row {blank[0]}; fill it in on every row")
             continue
+        if np.asarray(values).dtype.kind in "mM":
+            raise ValueError(f"{file}: column {name!r} holds dates or durations; give numbers, times in seconds")
         try:
             rows[name] = np.asarray(values).astype(np.float64)
         except (TypeError, ValueError):
@@ -122,7 +126,8 @@ def read_run(file: str, name: str, rows: dict[str, np.ndarray], columns: Columns
     return Episode(
         name=name,
         run=name,
-        time=time,
+        # From 0 where, as beside the seconds since 1970, a double has no room for the tolerances of a clock.
+        time=time - time[0] if np.spacing(np.abs(time).max()) > FINEST else time,
         qpos=stack("qpos", columns.qpos, np.nan),
         qvel=stack("qvel", columns.qvel, np.nan),
         ctrl=stack("ctrl", columns.ctrl, 0.0),

@@ -281,6 +281,8 @@ def _read_csv(path: str) -> dict[str, np.ndarray]:
             rows = [row for row in csv.reader(stream) if row]
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise ValueError(f"{path}: no whole gzip file ({error}); write it again") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: no text in UTF-8 ({error}); save the table as CSV in UTF-8") from error
     if not rows:
         raise ValueError(f"{path}: the file is empty; give a header and one row a sample")
     header = rows.pop(0)

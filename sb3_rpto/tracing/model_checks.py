@@ -11,6 +11,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 from scipy.signal import savgol_filter
 
+from sb3_rpto.effects import Declared
 from sb3_rpto.effects.simulation import FILTERS
 from sb3_rpto.tracing.checks import WINDOW, Finding, smoothed_velocity
 from sb3_rpto.tracing.columns import columns_of, joint_of
@@ -20,6 +21,8 @@ from sb3_rpto.tracing.windows import discretised, stiff
 ALL = "all episodes"
 SLOW = 0.02
 """A machine sampled at longer steps than this, in s, is said to be sampled slowly."""
+LONGEST_STEP, MOST_SUBSTEPS = 0.5, 500
+"""Samples farther apart than this in s, and than so many steps of the model, are taken for times in another unit."""
 LAG = 2
 """A response that is later than this many samples is reported."""
 SMOOTHING = 0.06
@@ -49,10 +52,13 @@ def check_against(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     :param data: recordings, their names as in the model; the order of the columns does not matter
     :return: what was found, nothing is repaired
     :raises ValueError: joints or actuators that are not in both, or a wrong number of coordinates (the message names
-        the nearest names), actuators that integrate their commands
+        the nearest names), actuators that integrate their commands, a clock that is not in seconds, ``param`` columns
+        with values that the number cannot have
     """
     check_names(model, data)
     _check_actuators(model)
+    _check_clock(model, data)
+    _check_settings(model, data)
     return _sampling(model, data) + _responses(model, data)
 
 
@@ -103,6 +109,30 @@ def _check_actuators(model: mujoco.MjModel) -> None:
                 f"actuator {name!r} has a state of its own (dyntype {kind}) that no column holds and no commands tell; "
                 "model it without, and give what it puts out as its command"
             )
+
+
+def _check_clock(model: mujoco.MjModel, data: Measurements) -> None:
+    """Refuse samples so far apart that their times can hardly be in seconds."""
+    steps = [np.diff(e.time) for e in data.episodes if len(e) > 1]
+    step = float(np.median(np.concatenate(steps))) if steps else 0.0
+    if not data.exact and step > max(LONGEST_STEP, MOST_SUBSTEPS * model.opt.timestep):
+        raise ValueError(
+            f"the median step of column 'time' is {step:g} s, the model's {model.opt.timestep:g} s; give times in "
+            "seconds, or sample the machine faster"
+        )
+
+
+def _check_settings(model: mujoco.MjModel, data: Measurements) -> None:
+    """Refuse known settings that are below what the model's number may be."""
+    for name in data.columns.params:
+        parameter = Declared(model, name, (-np.inf, np.inf))
+        for episode in data.episodes:
+            value = episode.params[name]
+            if value < 0 or (parameter.scales and value == 0):
+                raise ValueError(
+                    f"{episode.name}: column 'param.{name}' holds {value:g}; it must be "
+                    f"{'above' if parameter.scales else 'at least'} 0, such as the model's {parameter.nominal:g}"
+                )
 
 
 def _sampling(model: mujoco.MjModel, data: Measurements) -> list[Finding]:

@@ -9,16 +9,17 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects import LIBRARY, Effect, Scales, Simulation, declare
+from sb3_rpto.effects import LIBRARY, Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.model_checks import check_against
+from sb3_rpto.tracing.model_checks import check_against, check_names
 from sb3_rpto.tracing.origin import origin
 from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.search import Selectors
 from sb3_rpto.tracing.select import Selector
+from sb3_rpto.tracing.turns import settle_turns
 from sb3_rpto.tracing.windows import Windows, cut, discretised, noise_levels
 
 #: Most windows to fit, and to select on.
@@ -41,6 +42,7 @@ class SetUp:
     """What the search works on.
 
     :param spec: of the model; None where it was given compiled
+    :param nominal: the model as it was given
     :param findings: about the data
     :param train: recordings to fit to
     :param select: to decide on
@@ -55,6 +57,7 @@ class SetUp:
     """
 
     spec: mujoco.MjSpec | None
+    nominal: mujoco.MjModel
     findings: list[Finding]
     train: Measurements
     select: Measurements
@@ -92,7 +95,9 @@ def prepare(
     Parameters and errors as :func:`sb3_rpto.tracing.trace.trace`.
     """
     spec, compiled = load_model(model)
-    findings = [*data.findings, *check_against(compiled, data)]
+    check_names(compiled, data)
+    data, turned = settle_turns(compiled, data)
+    findings = [*data.findings, *turned, *check_against(compiled, data)]
     train, select, test = data.split(seed)
     findings += [f for f in train.findings if f not in findings]
     fitted = replace(data, episodes=train.episodes + select.episodes)
@@ -107,18 +112,19 @@ def prepare(
         noise = "without noise" if data.exact else "with noise"
         message = f"from the model's own steps in time, {noise}: they meet them better than the continuous motion does"
         findings.append(Finding("simulated", "fitted runs", message))
-    nominal = discretised(compiled, data, fine=True)
+    nominal = discretised(compiled, fitted, fine=True)
     known = declare(nominal, declared)
-    twice = {d.label for d in known} & set(data.columns.params)
-    if twice:
-        name = sorted(twice)[0]
-        raise ValueError(f"declared {name!r} is the column 'param.{name}' of the data, too; leave one of them out")
+    settings = {Declared(nominal, name, (-np.inf, np.inf)).number: name for name in data.columns.params}
+    for one in known:
+        if one.number in settings:
+            column = f"param.{settings[one.number]}"
+            raise ValueError(f"declared {one.label!r} is the column {column!r} of the data, too; leave one of them out")
     effects: list[Effect] = [*known, *_candidates(nominal, [d.label for d in known], kinds)]
     fine = Simulation(nominal, effects, threads)
     scales = typical(fine, force_residuals(fine, fine.null, fitted)).scales(effects)
-    rough = Simulation(discretised(compiled, data, fine=False), effects, threads)
+    rough = Simulation(discretised(compiled, fitted, fine=False), effects, threads)
     longer = _longer(rough.model, train, select, sigma, length) if horizon is None else None
-    return SetUp(spec, findings, train, select, test, fitted, sigma, fine, rough, scales, length, longer)
+    return SetUp(spec, compiled, findings, train, select, test, fitted, sigma, fine, rough, scales, length, longer)
 
 
 def _candidates(model: mujoco.MjModel, declared: list[str], kinds: Sequence[str] | None) -> list[Effect]:

@@ -252,6 +252,7 @@ class Report:
             ]
 
         def traced(t: Traced) -> dict[str, Any]:
+            evidence = {} if isinstance(t.effect, Declared) else {"gain": t.gain, "t": t.t, "frequency": t.frequency}
             return {
                 "label": t.label,
                 "parameters": {
@@ -260,9 +261,7 @@ class Report:
                 },
                 "equation": t.effect.equation,
                 "alike": t.alike,
-                "gain": t.gain,
-                "t": t.t,
-                "frequency": t.frequency,
+                **evidence,
                 "carried_by": carried_by(t.effect),
             }
 

@@ -79,17 +79,19 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     if data.exact:
         for column, dof in enumerate(velocity_addresses(nominal, data)):
             qvel[:, dof] = np.interp(time, e.time, e.qvel[:, column])
+    active = [
+        (effect, values[None, s])
+        for effect, s in zip(simulation.effects, simulation.slices)
+        if effect.kind == "declared" or np.any((values[s] != simulation.null[s])[simulation.strength[s]])
+    ]
+    for effect, x in reversed([pair for pair in active if pair[0].senses]):
+        _undo_sensor(effect, np.repeat(x, len(time), axis=0), time, qpos, qvel)
     qacc = np.gradient(qvel, h, axis=0)
     row = np.clip(np.searchsorted(e.time, time + 1e-9, side="right") - 1, 0, len(e) - 1)
     commands = np.zeros((1, len(time), nominal.nu))
     enabled = np.ones_like(commands)
     order = command_order(nominal, data)
     commands[0][:, order], enabled[0][:, order] = e.ctrl[row] * e.enabled[row], e.enabled[row]
-    active = [
-        (effect, values[None, s])
-        for effect, s in zip(simulation.effects, simulation.slices)
-        if effect.kind == "declared" or np.any((values[s] != simulation.null[s])[simulation.strength[s]])
-    ]
     commands = filter_commands(active, commands, h)[0]
     # The motion at a sample answers to the commands held before and after it alike.
     around = 0.5 * (commands + np.concatenate([commands[:1], commands[:-1]]))
@@ -138,6 +140,15 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     edge = 1 if data.exact else min(round(EDGE / (_cutoff(h) * h)), len(time) // 4)
     arrays = (a[edge : len(time) - edge] for a in (time - time[0], shown, qvel, load, commands, force))
     return ForceResidual(e.name, *arrays)
+
+
+def _undo_sensor(effect: Effect, x: np.ndarray, time: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
+    """Turn, in place, what a joint's sensor showed into the motion itself, (T, nq) and (T, nv); x is (T, p)."""
+    adr, dof = effect.adr, effect.dof
+    q, v = effect.unobserve(qpos[:, adr], qvel[:, dof], x)
+    then = time + effect.late(x)  # what is true at a time is shown later; at the end it goes on as it was
+    qpos[:, adr] = np.interp(then, time, q) + v[-1] * np.maximum(then - time[-1], 0.0)
+    qvel[:, dof] = np.interp(then, time, v)
 
 
 def _cutoff(h: float) -> float:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
@@ -118,8 +117,8 @@ def trace(
         threshold=selector.limit(selection.model)[0],
         horizon=selector.horizon,
         seed=seed,
-        # An environment may hold other numbers than its file, which the specification would lose.
-        source=model if set_up.spec is None or isinstance(model, gym.Env) else set_up.spec,
+        # As it was: an environment's model may be corrected before the report is saved.
+        source=model if set_up.spec is None else (set_up.spec, set_up.nominal),
         simulation=simulation,
         values_before=before.values,
         values_after=final,
@@ -306,6 +305,9 @@ def _candidate(
         return Candidate(effect.label, "not excited", f"to see it: {effect.excite}", sensitivity, alike)
     if i in selection.dropped:
         step, evidence = selection.dropped[i]
-        why = f"removal costs {evidence.gain:+.1%} of the error (t = {evidence.t:.1f})"
-        return Candidate(effect.label, "dropped", f"step {step}: {why}", sensitivity, alike)
+        together = sum(of == step for of, _ in selection.dropped.values()) - 1
+        what = "removal" if not step or not together else f"removal together with {together} other(s)"
+        why = f"{what} costs {evidence.gain:+.1%} of the error (t = {evidence.t:.1f})"
+        when = f"step {step}" if step else "at the end"
+        return Candidate(effect.label, "dropped", f"{when}: {why}", sensitivity, alike)
     return Candidate(effect.label, "dropped", f"looks like {alike[0]}" if alike else _NEVER, sensitivity, alike)

@@ -224,6 +224,9 @@ def cut(
     :param overlap: share of a window that the next one covers too, in [0, 1)
     :raises ValueError: no episode is as long as a window
     """
+    step = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
+    if horizon < 1.99 * step:
+        raise ValueError(f"a window of {horizon:g} s holds fewer than two steps of {step:.4g} s; raise horizon")
     starts = []
     for number, e in enumerate(data.episodes):
         begin = first_sample(model, e, data.exact)

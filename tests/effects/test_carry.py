@@ -317,6 +317,17 @@ def test_models_load_from_every_source(tmp_path):
     assert model is not env.unwrapped.model
 
 
+def test_an_environment_that_was_corrected_meanwhile_is_saved_as_it_was(tmp_path):
+    env = gym.make("InvertedPendulum-v5")
+    pair = load_model(env)
+    lacks = [LIBRARY["coulomb_friction"]("slider", level=0.5), LIBRARY["payload"]("pole", mass=1.0)]
+    save_corrected(tmp_path / "first", pair, lacks)
+    CorrectedEnv(env, lacks)
+    save_corrected(tmp_path / "second", pair, lacks)
+    for name in ("model.xml", "effects.json"):
+        assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
+
+
 def test_bad_sources_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="no MJCF file"):
         load_model(tmp_path / "missing.xml")

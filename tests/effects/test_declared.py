@@ -106,6 +106,11 @@ def test_a_string_is_no_list() -> None:
         declare(MODEL, "hinge.damping")
 
 
+def test_one_number_is_declared_once_by_whatever_name() -> None:
+    (found,) = declare(MODEL, ["hinge.damping", "joint:hinge.damping=0.001:2"])
+    assert (found.parameters[0].lower, found.parameters[0].upper) == (0.001, 2.0)
+
+
 def test_prefixes_tell_objects_of_one_name_apart() -> None:
     mass, armature = declare(MODEL, ["body:shared.mass", "joint:shared.armature"])
     assert mass.values == [MODEL.body("shared").mass]

@@ -175,6 +175,27 @@ def test_gzipped_csv(tmp_path):
     np.testing.assert_array_equal(episode.qpos[:, 0], swing()["qpos.hinge"])
 
 
+def test_a_table_in_another_encoding_is_told(tmp_path):
+    (tmp_path / "a.csv").write_text("time,qpos.hinge\n0,0\n", encoding="utf-16")
+    with pytest.raises(ValueError, match=r"a\.csv: no text in UTF-8 .* save the table as CSV in UTF-8"):
+        Measurements.from_csv(tmp_path / "a.csv")
+
+
+def test_dates_are_no_seconds():
+    table = swing()
+    table["time"] = np.datetime64("2026-01-01") + (1e9 * table["time"]).astype("timedelta64[ns]")
+    with pytest.raises(ValueError, match="column 'time' holds dates or durations; give numbers, times in seconds"):
+        Measurements.from_tables({"a": table})
+
+
+def test_seconds_since_1970_are_as_good_as_any():
+    table = swing()
+    (ours,) = Measurements.from_tables({"a": table}).episodes
+    (theirs,) = Measurements.from_tables({"a": table | {"time": table["time"] + 1.7e9}}).episodes
+    np.testing.assert_allclose(theirs.time, ours.time, atol=1e-6)
+    assert theirs.time[0] == 0
+
+
 def test_no_tables_no_files():
     with pytest.raises(ValueError, match="no tables"):
         Measurements.from_tables({})

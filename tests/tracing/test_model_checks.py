@@ -167,6 +167,22 @@ def test_a_machine_that_is_sampled_slowly():
     assert found(model, tables) == [("slow sampling", "all episodes, time")]
 
 
+def test_times_in_milliseconds_are_refused():
+    tables = {run: table | {"time": 1e3 * table["time"]} for run, table in measured(model_of()).items()}
+    with pytest.raises(ValueError, match=r"median step of column 'time' is 10 s.*give times in seconds"):
+        found(model_of(), tables)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [("option.gravity", -9.81, "above 0, such as the model's 9.81"), ("shoulder.damping", -0.1, "at least 0")],
+)
+def test_settings_that_a_number_cannot_have_are_refused(name, value, said):
+    tables = {run: table | {f"param.{name}": np.full(400, value)} for run, table in measured(model_of()).items()}
+    with pytest.raises(ValueError, match=f"column 'param.{name}' holds {value:g}; it must be {said}"):
+        found(model_of(), tables)
+
+
 def test_names_that_the_model_has_not():
     model = model_of()
     table = simulate(model, 0)

@@ -10,6 +10,7 @@ from sb3_rpto.effects import Simulation, declare
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag
+from sb3_rpto.effects.sensors import SensorBias, SensorDelay, SensorGain
 from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.residuals import ForceResidual, force_residuals, learnable_share, summary, typical
 
@@ -71,6 +72,29 @@ def test_a_traced_torque_is_no_longer_in_the_residual() -> None:
     effect = TorqueOffset("hinge", offset=0.2)
     for r in residuals(swinging([effect]), [effect]):
         np.testing.assert_allclose(inner(r, r.force), 0, atol=0.03)
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [SensorBias("hinge", offset=0.3), SensorGain("hinge", change=0.15), SensorDelay("hinge", delay=0.03)],
+    ids=lambda effect: effect.kind,
+)
+def test_a_known_fault_of_a_sensor_is_taken_off(sensor: Effect) -> None:
+    true = swinging([])
+    sensor.bind(compiled())
+    episodes = []
+    for e in true.episodes:
+        x = np.tile(sensor.values, (len(e), 1))
+        then = e.time - sensor.late(x)
+        shown = sensor.observe(np.interp(then, e.time, e.qpos[:, 0]), np.interp(then, e.time, e.qvel[:, 0]), x)
+        qpos = e.qpos.copy()
+        qpos[:, 0] = shown[0]
+        episodes.append(replace(e, qpos=qpos))
+    left = [
+        np.std(np.concatenate([inner(r, r.force) for r in residuals(replace(true, episodes=episodes), effects)]))
+        for effects in ([], [sensor])
+    ]
+    assert left[1] < 0.05 * left[0]
 
 
 def test_dry_friction_shows_as_its_level_against_the_motion() -> None:

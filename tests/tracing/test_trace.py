@@ -22,6 +22,7 @@ from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.adequacy import Adequacy
+from sb3_rpto.tracing.prepare import SetUp, prepare
 from sb3_rpto.tracing.trace import judge
 
 #: the longest steps that the recording and the trace may have
@@ -366,3 +367,22 @@ def test_dry_friction_that_an_environment_lacks_is_found() -> None:
     corrected = report.apply(env)
     assert corrected.unwrapped.model.dof_frictionloss[0] == pytest.approx(1.0, rel=0.1)
     assert env.unwrapped.model.dof_frictionloss[0] == 0
+
+
+def test_how_test_runs_were_sampled_changes_nothing_of_the_fit() -> None:
+    made = planted(("coulomb_friction", "large"))
+
+    def fitted_with(speed: float) -> SetUp:
+        # Most of the samples are the test runs'.
+        episodes = [
+            replace(e, part="test", time=e.time / speed) if i < 4 else replace(e, part="train")
+            for i, e in enumerate(made.measurements.episodes)
+        ]
+        data = replace(made.measurements, episodes=episodes)
+        return prepare(made.xml, data, made.declared, 0, NATIVE, None, 1)
+
+    ours, theirs = fitted_with(1.0), fitted_with(20.0)
+    for name in ("fine", "rough"):
+        assert getattr(ours, name).model.opt.timestep == getattr(theirs, name).model.opt.timestep
+    np.testing.assert_array_equal(ours.sigma, theirs.sigma)
+    assert (ours.length, ours.longer, ours.scales) == (theirs.length, theirs.longer, theirs.scales)

@@ -316,6 +316,11 @@ def test_a_horizon_longer_than_every_episode_is_refused_with_the_longest() -> No
         cut(compiled(), ramps([clock(100), 3 + clock(300)]), SIGMA, 5.0, 10)
 
 
+def test_a_horizon_shorter_than_two_steps_is_refused_with_the_step() -> None:
+    with pytest.raises(ValueError, match=r"window of 0\.005 s holds fewer than two steps of 0\.005 s; raise horizon"):
+        cut(compiled(), ramps([clock(100)]), SIGMA, 0.005, 10)
+
+
 def test_exact_data_start_at_the_recorded_state_with_no_spread() -> None:
     data = recorded(noise=0.0, exact=True)
     windows = cut(compiled(), data, SIGMA, 0.4, 100)

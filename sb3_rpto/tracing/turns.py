@@ -1,0 +1,51 @@
+"""Whole turns by which an encoder's angle is off from the model's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.measurements import Measurements
+
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+#: A position this far, in rad or m, beyond a joint's limits is said to be: limits give way a little.
+BEYOND = 0.1
+
+
+def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurements, list[Finding]]:
+    """Shift angles by whole turns to where the model has limits or a spring: an encoder's zero tells no turns.
+
+    A hinge with limits is shifted where its angles lie outside them; one with a spring only where its angle was
+    unwrapped, for a spring may be wound up. Positions that stay outside their limits are said to.
+
+    :param model: of the machine, with the data's joints
+    :param data: recordings; not changed
+    :return: the recordings, and what was found
+    """
+    wrapped = {finding.where for finding in data.findings if finding.kind == "wrapped angle"}
+    found, episodes = [], []
+    for episode in data.episodes:
+        qpos = episode.qpos.copy()
+        for column, name in enumerate(data.columns.qpos):
+            joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
+            if joint < 0:  # a coordinate of a ball or free joint
+                continue
+            where, limited = f"{episode.name}, qpos.{name}", bool(model.jnt_limited[joint])
+            low, high = model.jnt_range[joint] if limited else (-np.inf, np.inf)
+            middle = float(np.median(qpos[:, column]))
+            if model.jnt_type[joint] == _HINGE and ((not low <= middle <= high) or where in wrapped):
+                centre = (low + high) / 2 if limited else float(model.qpos_spring[model.jnt_qposadr[joint]])
+                turns = round((middle - centre) / (2 * np.pi)) if limited or model.jnt_stiffness[joint] else 0
+                if turns:
+                    qpos[:, column] -= 2 * np.pi * turns
+                    why = "limits" if limited else "spring"
+                    found.append(Finding("whole turns", where, f"{turns:+d} turn(s) from the joint's {why}; taken off"))
+            over = float(np.maximum(low - qpos[:, column], qpos[:, column] - high).max())
+            if over > BEYOND and not data.exact:
+                message = f"up to {over:.3g} beyond the joint's limits in the model: another zero, or other units"
+                found.append(Finding("outside limits", where, message))
+        episodes.append(replace(episode, qpos=qpos))
+    return replace(data, episodes=episodes), found

@@ -1,0 +1,51 @@
+"""Whole turns between an encoder's zero and the model's."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from sb3_rpto.tracing import Measurements
+from sb3_rpto.tracing.turns import settle_turns
+
+TURN = 2 * np.pi
+ANGLE = 0.4 * np.sin(np.linspace(0, 6, 200)) - 0.1
+
+
+def arm(joint: str) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(f"""<mujoco><compiler angle="radian"/><worldbody><body>
+        <joint name="hinge" axis="0 1 0" {joint}/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".03"/>
+        </body></worldbody></mujoco>""")
+
+
+def recorded(angle: np.ndarray) -> Measurements:
+    return Measurements.from_tables({"run": {"time": np.arange(len(angle)) * 0.01, "qpos.hinge": angle}})
+
+
+@pytest.mark.parametrize("joint", ['range="-1.5 1.5"', 'stiffness="0.5"'], ids=["limits", "spring"])
+@pytest.mark.parametrize("start", [0, 30], ids=["begins below zero", "begins above zero"])
+def test_a_wrapped_angle_comes_to_where_the_model_has_it(joint: str, start: int) -> None:
+    angle = ANGLE[start:]
+    data, found = settle_turns(arm(joint), recorded(np.mod(angle, TURN)))
+    np.testing.assert_allclose(data.episodes[0].qpos[:, 0], angle, atol=1e-12)
+    assert {f.kind for f in found} <= {"whole turns"}
+
+
+def test_an_angle_outside_its_limits_is_shifted_though_it_never_wrapped() -> None:
+    data, found = settle_turns(arm('range="-1.5 1.5"'), recorded(ANGLE + TURN))
+    np.testing.assert_allclose(data.episodes[0].qpos[:, 0], ANGLE, atol=1e-12)
+    assert [f.kind for f in found] == ["whole turns"]
+
+
+@pytest.mark.parametrize("joint", ["", 'stiffness="0.5"'], ids=["free", "wound-up spring"])
+def test_turns_that_may_be_meant_stay(joint: str) -> None:
+    data, found = settle_turns(arm(joint), recorded(ANGLE + 2 * TURN))
+    np.testing.assert_array_equal(data.episodes[0].qpos[:, 0], ANGLE + 2 * TURN)
+    assert found == []
+
+
+def test_what_no_turn_accounts_for_is_said_and_kept() -> None:
+    degrees = np.degrees(ANGLE[:100])
+    _, found = settle_turns(arm('range="-1.5 1.5"'), recorded(degrees))
+    assert "outside limits" in [f.kind for f in found]
