@@ -15,6 +15,8 @@ from sb3_rpto.effects.names import SCALAR_JOINTS, near, object_id, object_names
 from sb3_rpto.effects.world import World
 
 OBJECTS = ("joint", "body", "geom", "actuator")
+#: Dry friction in N·m or N that is left of a model's own.
+LEAST_FRICTION = 1e-12
 
 
 class _Kind(NamedTuple):
@@ -35,6 +37,8 @@ def _dof(name: str) -> tuple[Callable[[mujoco.MjModel, int], float], Callable[[W
         dof = int(world.model.jnt_dofadr[joint])
         if name == "dof_frictionloss":
             world.rough(dof)
+            # At 0 nothing would tell a saved model that the joint has a constraint of its own.
+            values = np.maximum(values, LEAST_FRICTION) if nominal > 0 else values
         world.field(name)[:, dof] = values
 
     return read, write

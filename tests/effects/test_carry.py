@@ -105,6 +105,20 @@ def assert_equal_rollouts(one, other):
         np.testing.assert_array_equal(a, b)
 
 
+def test_a_joint_whose_friction_is_fitted_away_reloads_with_its_own_constraint(tmp_path):
+    spec = mujoco.MjSpec.from_string("""<mujoco><worldbody><body>
+        <joint name="hinge" axis="0 1 0" damping="0.05" frictionloss="0.02"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.5" size="0.03"/></body></worldbody></mujoco>""")
+    model, start, free = spec.copy().compile(), np.array([[1.0]]), Drive(np.zeros((1, 500, 0)))
+    gone = declare(model, ["hinge.frictionloss"])[0].with_values(np.array([0.0]))
+    lacks = [gone, StribeckFriction("hinge", extra=0.02, level=0.02, speed=0.3)]
+    traced = Simulation(model, lacks, 1)
+    save_corrected(tmp_path, spec, lacks)
+    saved = load_corrected(tmp_path).simulation(1)
+    ours, theirs = (s.rollout(s.values()[None], start, np.zeros((1, 1)), free)[0] for s in (traced, saved))
+    np.testing.assert_array_equal(ours, theirs)
+
+
 def test_a_saved_simulator_reloads_bit_for_bit(tmp_path):
     nominal = load_model(PLAIN)[1]
     chosen = effects(nominal)
