@@ -76,9 +76,9 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
             dof = scalar[int(address)]
             shown[:, dof] = path
             qvel[:, dof] = np.gradient(path, h)
-    if data.exact:
-        for column, dof in enumerate(velocity_addresses(nominal, data)):
-            qvel[:, dof] = np.interp(time, e.time, e.qvel[:, column])
+    for column, dof in enumerate(velocity_addresses(nominal, data)):
+        if data.exact or dof not in scalar.values():  # quaternions are not differentiated
+            qvel[:, dof] = low(np.interp(time, e.time, e.qvel[:, column]))
     active = [
         (effect, values[None, s])
         for effect, s in zip(simulation.effects, simulation.slices)

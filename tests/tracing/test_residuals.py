@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 from simulated import RATE, WITH_WHEEL, compiled, recorded
 
-from sb3_rpto.effects import Simulation, declare
+from sb3_rpto.effects import Drive, Simulation, declare
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag
@@ -144,6 +145,20 @@ def test_a_setting_of_a_run_is_in_its_model() -> None:
     known = [replace(e, params={"pole.mass": 0.8}) for e in data.episodes]
     plain, told = summary(residuals(data)), summary(residuals(replace(data, episodes=known)))
     assert told[0] < 0.05 * plain[0]
+
+
+def test_the_motion_of_a_floating_base_is_in_the_residual_of_its_joints() -> None:
+    model = mujoco.MjModel.from_xml_string("""<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body>
+        <freejoint name="root"/><geom type="box" size=".1 .1 .1" mass="1"/><body pos=".1 0 0">
+        <joint name="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".02" mass=".5"/>
+        </body></body></worldbody></mujoco>""")
+    simulation, spin = Simulation(model, [], 1), np.array([[0, 0, 0, 0, 2.0, 0, 1.0]])
+    q, v = simulation.rollout(np.empty((1, 0)), model.qpos0[None], spin, Drive(np.zeros((1, 2000, 0))))
+    q, v = q[0, :-1:5], v[0, :-1:5]
+    table = {"time": 0.01 * np.arange(len(q)), "qpos.hinge": q[:, 7], "qvel.hinge": v[:, 6]}
+    table |= {f"qpos.root.{i}": q[:, i] for i in range(7)} | {f"qvel.root.{i}": v[:, i] for i in range(6)}
+    (found,) = force_residuals(simulation, simulation.null, Measurements.from_tables({"run": table}))
+    assert np.sqrt(np.mean(found.force[:, 6] ** 2)) < 0.005
 
 
 def test_typical_magnitudes_are_those_of_the_motion() -> None:
