@@ -251,9 +251,8 @@ class TwoWorlds(PolicySnapshots):
         """Reset the target and what SB3 keeps of it."""
         assert self.target_env is not None  # learn() has checked
         n_envs, noise = self.target_env.num_envs, self.action_noise
-        if noise is not None and n_envs != getattr(
-            noise, "n_envs", 1
-        ):  # also where the last target was of another width
+        # The last target may have been of another width.
+        if noise is not None and n_envs != getattr(noise, "n_envs", 1):
             single = noise.base_noise if isinstance(noise, VectorizedActionNoise) else noise
             self.action_noise = single if n_envs == 1 else VectorizedActionNoise(single, n_envs)
         self._last_obs = np.asarray(self.target_env.reset())

@@ -14,7 +14,7 @@ from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.model_checks import check_against, check_names
+from sb3_rpto.tracing.model_checks import check_against
 from sb3_rpto.tracing.origin import origin
 from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.search import Selectors
@@ -95,7 +95,6 @@ def prepare(
     Parameters and errors as :func:`sb3_rpto.tracing.trace.trace`.
     """
     spec, compiled = load_model(model)
-    check_names(compiled, data)
     data, turned = settle_turns(compiled, data)
     findings = [*data.findings, *turned, *check_against(compiled, data)]
     train, select, test = data.split(seed)

@@ -21,7 +21,7 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
     A hinge with limits is shifted where its angles lie outside them; one with a spring only where its angle was
     unwrapped, for a spring may be wound up. Positions that stay outside their limits are said to.
 
-    :param model: of the machine, with the data's joints
+    :param model: of the machine
     :param data: recordings; not changed
     :return: the recordings, and what was found
     """
@@ -31,7 +31,7 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
         qpos = episode.qpos.copy()
         for column, name in enumerate(data.columns.qpos):
             joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
-            if joint < 0:  # a coordinate of a ball or free joint
+            if joint < 0:  # a coordinate of a ball or free joint, or a name that is refused later
                 continue
             where, limited = f"{episode.name}, qpos.{name}", bool(model.jnt_limited[joint])
             low, high = model.jnt_range[joint] if limited else (-np.inf, np.inf)

@@ -183,6 +183,12 @@ def test_settings_that_a_number_cannot_have_are_refused(name, value, said):
         found(model_of(), tables)
 
 
+def test_a_motor_that_is_known_to_turn_the_other_way_is_no_error():
+    plain = measured(model_of())
+    tables = {run: table | {"param.first.gear": np.full(400, -2.0)} for run, table in plain.items()}
+    assert found(model_of(), tables) == found(model_of(), plain)
+
+
 def test_names_that_the_model_has_not():
     model = model_of()
     table = simulate(model, 0)
