@@ -12,7 +12,6 @@ import torch as th
 from gymnasium import wrappers
 from scipy.interpolate import CubicHermiteSpline
 
-from sb3_rpto.dynamics.onestep import true_state
 from sb3_rpto.dynamics.physical import check_commands
 from sb3_rpto.effects import Effect, Simulation
 from sb3_rpto.effects.simulation import names_of
@@ -103,7 +102,7 @@ def transitions(
     for episode in measured.episodes:
         qpos, qvel, commands, whole = log.steps(episode)
         if simulation is not None and len(qpos):
-            true_state(simulation, np.tile(simulation.values(), (len(qpos), 1)), qpos, qvel)
+            simulation.undo_sensors(np.tile(simulation.values(), (len(qpos), 1)), qpos, qvel)
         seen = np.array([_observe(twin, *state) for state in zip(qpos, qvel, commands)])
         if whole.any():
             found["observations"].append(seen[:-1][whole])

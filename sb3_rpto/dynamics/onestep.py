@@ -11,8 +11,8 @@ from scipy.optimize import lsq_linear
 
 from sb3_rpto.dynamics.base import Transitions, predecessors
 from sb3_rpto.dynamics.identifiable import entangled, null_directions, to_hold
-from sb3_rpto.effects import Effect, Simulation
-from sb3_rpto.effects.sensors import ago, carry_on
+from sb3_rpto.effects import Simulation
+from sb3_rpto.effects.sensors import ago
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.envs.observations import StateMap
 
@@ -64,37 +64,17 @@ class Steps:
         qpos, qvel = np.tile(self.qpos, (k, 1)), np.tile(self.qvel, (k, 1))
         lasted = self.drive.commands.shape[1] - self.drive.before
         gained = (self.reached[:, simulation.model.nq :] - self.qvel) / (lasted * simulation.model.opt.timestep)
-        true_state(simulation, every, qpos, qvel, np.tile(gained, (k, 1)))
+        simulation.undo_sensors(every, qpos, qvel, np.tile(gained, (k, 1)))
         q, v = simulation.rollout(every, qpos, qvel, self.drive.take(np.tile(np.arange(n), k)))
         qpos, qvel = q[:, -1].copy(), v[:, -1].copy()
-        for effect, x in _sensors(simulation, every):
+        sensing = simulation.sensing(every)
+        for effect, x in sensing:
             steps = effect.late(x) / float(simulation.model.opt.timestep)
             if steps.any():
                 qpos[:, effect.adr], qvel[:, effect.dof] = ago(steps, q[:, :, effect.adr], v[:, :, effect.dof])
+        for effect, x in sensing:
             qpos[:, effect.adr], qvel[:, effect.dof] = effect.observe(qpos[:, effect.adr], qvel[:, effect.dof], x)
         return np.concatenate([qpos, qvel], axis=1).reshape(k, n, -1)
-
-
-def true_state(
-    simulation: Simulation, values: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, qacc: np.ndarray | None = None
-) -> None:
-    """Take back, in place, what the sensors make of the states; a late one's is carried on from then to now.
-
-    :param simulation: whose effects on sensors count
-    :param values: (n, p)
-    :param qpos: as the sensors show it, (n, nq)
-    :param qvel: (n, nv)
-    :param qacc: how fast the speeds change, (n, nv); None: not at all
-    """
-    qacc = np.zeros_like(qvel) if qacc is None else qacc
-    for effect, x in _sensors(simulation, values):
-        qpos[:, effect.adr], qvel[:, effect.dof] = effect.unobserve(qpos[:, effect.adr], qvel[:, effect.dof], x)
-        carry_on(effect, x, qpos, qvel, qacc)
-
-
-def _sensors(simulation: Simulation, values: np.ndarray) -> list[tuple[Effect, np.ndarray]]:
-    pairs = zip(simulation.effects, simulation.slices)
-    return [(effect, values[:, s]) for effect, s in pairs if effect.senses]
 
 
 def as_steps(

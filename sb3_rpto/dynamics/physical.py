@@ -15,7 +15,7 @@ from gymnasium.wrappers import ClipAction
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
-from sb3_rpto.dynamics.onestep import OneStep, Steps, as_steps, true_state
+from sb3_rpto.dynamics.onestep import OneStep, Steps, as_steps
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.effect import from_json
 from sb3_rpto.effects.mjcf import PlainModel
@@ -230,7 +230,7 @@ class PhysicalDynamics(Dynamics):
         commands = np.repeat(np.clip(actions.astype(np.float64), *self._limits()), self.frame_skip, axis=1)
         qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
         values = np.tile(self.values, (len(observations), 1))
-        true_state(self.simulation, values, qpos, qvel)
+        self.simulation.undo_sensors(values, qpos, qvel)
         q, v = self.simulation.rollout(values, qpos, qvel, Drive(commands))
         return bool(np.isfinite(q).all() and np.isfinite(v).all())
 
@@ -287,7 +287,7 @@ class PhysicalDynamics(Dynamics):
         twin.set_effects(self.effects())
         states = self.recover(observations.cpu().numpy())
         qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
-        true_state(self.simulation, np.tile(self.values, (len(qpos), 1)), qpos, qvel)
+        self.simulation.undo_sensors(np.tile(self.values, (len(qpos), 1)), qpos, qvel)
         following, rewards, ends = [], [], []
         for q, v, action in zip(qpos, qvel, actions.cpu().numpy()):
             twin.reset()

@@ -27,20 +27,6 @@ def ago(steps: np.ndarray, q: np.ndarray, v: np.ndarray) -> Pair:
     return (1 - part) * q[rows, k] + part * q[rows, after], (1 - part) * v[rows, k] + part * v[rows, after]
 
 
-def carry_on(effect: Effect, x: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, qacc: np.ndarray) -> None:
-    """Move, in place, the joint of a late sensor from the state that it shows to the present one, to second order.
-
-    :param effect: on the sensor
-    :param x: its parameters, (n, p)
-    :param qpos: (n, nq), of then
-    :param qvel: (n, nv), likewise
-    :param qacc: (n, nv), likewise
-    """
-    age, v, a = effect.late(x), qvel[:, effect.dof], qacc[:, effect.dof]
-    qpos[:, effect.adr] += age * (v + 0.5 * age * a)
-    qvel[:, effect.dof] += age * a
-
-
 @register
 class SensorDelay(Effect):
     r"""A sensor that is late, by its bus or its filter: it shows :math:`q(t - d)` and :math:`\dot q(t - d)`.

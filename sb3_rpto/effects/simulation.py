@@ -112,6 +112,31 @@ class Simulation:
             out_q[bad], out_v[bad] = np.nan, np.nan
         return out_q, out_v
 
+    def sensing(self, values: np.ndarray) -> Active:
+        """The effects on sensors with their parameters, of ``values`` (n, p)."""
+        return [(effect, values[:, s]) for effect, s in zip(self.effects, self.slices) if effect.senses]
+
+    def undo_sensors(
+        self, values: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, qacc: np.ndarray | None = None
+    ) -> None:
+        """Take back, in place, what the sensors make of states; the joint of a late one is carried on from then to now.
+
+        A sensor is late before anything else happens to what it shows. So what was done last is undone first, and
+        delays come at the end.
+
+        :param values: (n, p)
+        :param qpos: as the sensors show it, (n, nq)
+        :param qvel: likewise, (n, nv)
+        :param qacc: how fast the speeds change, (n, nv); None: not at all
+        """
+        sensing = self.sensing(values)
+        for effect, x in reversed(sensing):
+            qpos[:, effect.adr], qvel[:, effect.dof] = effect.unobserve(qpos[:, effect.adr], qvel[:, effect.dof], x)
+        for effect, x in sensing:
+            age, a = effect.late(x), 0.0 if qacc is None else qacc[:, effect.dof]
+            qpos[:, effect.adr] += age * (qvel[:, effect.dof] + 0.5 * age * a)
+            qvel[:, effect.dof] += age * a
+
     def _run(
         self,
         world: BatchWorld,

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
-from sb3_rpto.effects.sensors import carry_on
 from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.windows import Windows
 
@@ -108,7 +107,6 @@ class Problem:
         self.declared = np.array([e.kind == "declared" for e in simulation.effects for _ in e.parameters], dtype=bool)
         self.moving = np.flatnonzero((windows.spread > 0).any(axis=0))  # coordinates of the start that are free
         self.exact = windows.exact
-        self.sensors = [(e, s) for e, s in zip(simulation.effects, simulation.slices) if e.senses]
 
     def on(self, index: np.ndarray) -> Problem:
         """The same problem on the windows at ``index``."""
@@ -134,22 +132,19 @@ class Problem:
         for joint in range(model.njnt):
             # Only scalar joints have a spread, see start_state.
             qpos[:, model.jnt_qposadr[joint]] += shift[:, model.jnt_dofadr[joint]]
-        for effect, s in self.sensors:
-            qpos[:, effect.adr], qvel[:, effect.dof] = effect.unobserve(
-                qpos[:, effect.adr], qvel[:, effect.dof], values[:, s]
-            )
-            carry_on(effect, values[:, s], qpos, qvel, w.qacc[index])
+        self.simulation.undo_sensors(values, qpos, qvel, w.qacc[index])
         q, v = self.simulation.rollout(values, qpos, qvel, w.drive.take(index))
         dt, dofs = float(model.opt.timestep), self._dofs()
         out = interpolate(q, v, w.at[index], dt, w.columns, dofs)
-        for effect, s in self.sensors:
-            age = effect.late(values[:, s])
+        sensing = self.simulation.sensing(values)
+        for effect, x in sensing:
+            age = effect.late(x)
             for column in np.flatnonzero(w.columns == effect.adr) if age.any() else ():
                 at = w.at[index] - age[:, None] / dt
                 out[:, :, [column]] = interpolate(q, v, at, dt, w.columns[[column]], dofs[[column]])
-        for effect, s in self.sensors:
+        for effect, x in sensing:
             for column in np.flatnonzero(w.columns == effect.adr):
-                out[:, :, column] = effect.observe(out[:, :, column], out[:, :, column], values[:, None, s])[0]
+                out[:, :, column] = effect.observe(out[:, :, column], out[:, :, column], x[:, None])[0]
         return out
 
     def _dofs(self) -> np.ndarray:

@@ -56,8 +56,10 @@ def test_the_true_numbers_reach_what_the_target_reached(env_id, scale):
         [ActuatorLag("slide", time_constant=0.01)],
         [StribeckFriction("slider", extra=0.3, level=0.2, speed=0.4)],
         [SensorBias("hinge", offset=0.05), SensorGain("hinge2", change=0.1)],
+        [SensorGain("hinge", change=0.1), SensorBias("hinge", offset=0.05)],
+        [SensorBias("hinge", offset=0.05), SensorGain("hinge", change=0.1)],
     ],
-    ids=lambda effects: effects[0].kind,
+    ids=lambda effects: " ".join(effect.kind for effect in effects),
 )
 def test_true_effects_reach_what_the_target_reached(effects):
     """Through several episodes, so commands from before an episode would show."""
@@ -71,14 +73,17 @@ def test_true_effects_reach_what_the_target_reached(effects):
     assert missed(steps, sim, sim.null) > 1e-3
 
 
-def test_a_late_sensor_is_carried_on_to_the_present():
+@pytest.mark.parametrize("beside", [[], [SensorGain("hinge2", change=0.1)]], ids=["alone", "after a gain"])
+def test_a_late_sensor_is_carried_on_to_the_present(beside):
     """To second order, by the speed it gained: the other joint, which it drives, then moves as it did."""
-    late = [SensorDelay("hinge2", delay=0.01)]
+    late = [*beside, SensorDelay("hinge2", delay=0.01)]
     steps, sim = steps_of(collect(shifted(POLES, {}, late), 60, scale=0.3), POLES), simulation(POLES, [], late)
-    reached = steps.reach(sim, np.array([[0.0], [0.005], [0.01], [0.015]]))
-    errors = np.median(np.abs(reached - steps.reached), axis=1)[:, 1]
-    assert errors.argmin() == 2
-    assert errors[2] < errors[0] / 3
+    known = [0.1] * len(beside)
+    reached = steps.reach(sim, np.array([[*known, delay] for delay in (0.0, 0.005, 0.01, 0.015)]))
+    errors = np.median(np.abs(reached - steps.reached), axis=1)
+    assert errors[:, 1].argmin() == 2
+    assert errors[2, 1] < errors[0, 1] / 3
+    assert errors[2, 2] < 0.01, "what it shows itself"
 
 
 def test_several_phis_at_once_are_those_one_by_one():

@@ -1,5 +1,7 @@
 """Many simulations side by side are the same as MuJoCo one by one."""
 
+from itertools import permutations
+
 import mujoco
 import numpy as np
 import pytest
@@ -220,6 +222,21 @@ def test_spring_adds_to_the_models_own() -> None:
     both = model.__copy__()
     both.jnt_stiffness[1], both.qpos_spring[1] = 5.0, (2.0 * 0.5 + 3.0 * -0.5) / 5.0
     np.testing.assert_allclose(got[0][1], loop(both, qpos[1:], qvel[1:], commands[1:])[0][0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("kinds", list(permutations(["sensor_bias", "sensor_gain", "sensor_delay"])), ids=" ".join)
+def test_what_several_sensor_effects_make_of_one_joint_is_undone_in_whatever_order_they_act(kinds: tuple) -> None:
+    """A joint at a constant speed: 0.05 s ago it was at q - 0.05 v."""
+    given = {"sensor_bias": 0.3, "sensor_gain": 0.2, "sensor_delay": 0.05}
+    sim = Simulation(MODEL, [LIBRARY[kind]("elbow") for kind in kinds], 1)
+    values = np.tile([given[kind] for kind in kinds], (4, 1))
+    q, v, _ = start(4)
+    shown, speed = q - [[0, 0.05]] * v, v.copy()
+    for effect, x in sim.sensing(values):
+        shown[:, 1], speed[:, 1] = effect.observe(shown[:, 1], speed[:, 1], x)
+    sim.undo_sensors(values, shown, speed)
+    np.testing.assert_allclose(shown, q, atol=1e-12)
+    np.testing.assert_allclose(speed, v, atol=1e-12)
 
 
 def test_a_place_that_is_not_there_is_named() -> None:

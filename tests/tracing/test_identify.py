@@ -16,7 +16,7 @@ from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.effect import Effect, Parameter
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
-from sb3_rpto.effects.sensors import SensorBias, SensorDelay
+from sb3_rpto.effects.sensors import SensorBias, SensorDelay, SensorGain
 from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.identify import RIDGE, TRUST, UNSTABLE, Loss, Problem, interpolate
@@ -145,6 +145,18 @@ def test_a_sensors_bias_shifts_the_start_and_what_is_shown_alike() -> None:
     values[:, 2] = 0
     wrong = p.errors(p.residuals(values, np.zeros((count, 2)), np.arange(count)))
     assert np.median(right) < 0.1 * np.median(wrong)
+
+
+@pytest.mark.parametrize("bias_first", [True, False])
+def test_bias_and_gain_of_one_sensor_are_undone_in_the_opposite_order(bias_first: bool) -> None:
+    pair = [SensorBias("hinge", offset=0.3), SensorGain("hinge", change=0.2)][:: 1 if bias_first else -1]
+    data, (b, g) = recorded(true_effects(), noise=0.0), (0.3, 0.2)
+    rows = [(1 + g) * (e.qpos + b) if bias_first else (1 + g) * e.qpos + b for e in data.episodes]
+    data = replace(data, episodes=[replace(e, qpos=q, qvel=(1 + g) * e.qvel) for e, q in zip(data.episodes, rows)])
+    p = problem([*true_effects(), *pair], data)
+    count = len(p.windows)
+    values = np.tile([*TRUE, *(effect.values[0] for effect in pair)], (count, 1))
+    np.testing.assert_array_less(p.errors(p.residuals(values, np.zeros((count, 2)), np.arange(count))), 0.5)
 
 
 def test_derivatives_are_differences_of_residuals() -> None:

@@ -208,6 +208,7 @@ def simulate(
                 positions = np.stack([q_then[:, effect.adr] for q_then, _ in recent], axis=1)
                 velocities = np.stack([v_then[:, effect.dof] for _, v_then in recent], axis=1)
                 q[:, effect.adr], v[:, effect.dof] = ago(steps, positions, velocities)
+        for effect, x in sensors:
             q[:, effect.adr], v[:, effect.dof] = effect.observe(q[:, effect.adr], v[:, effect.dof], x)
         measured[:, :, k] = q, v = q + errors[0, k], v + errors[1, k]
         u = excitation.command(k, q[:, moved] - machine.rest, v[:, moved])
