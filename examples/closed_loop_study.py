@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--shifts", nargs="+", default=list(study.SHIFTS), choices=study.SHIFTS)
     parser.add_argument("--methods", nargs="+", default=list(study.METHODS), choices=list(study.METHODS))
     parser.add_argument("--targets", nargs="+", type=int, default=list(study.TARGETS))
-    parser.add_argument("--seeds", type=int, default=5, help="how many (default: 5)")
+    parser.add_argument("--seeds", type=int, default=5, help="how many (default: 5); 0: only write the tables")
     parser.add_argument("--budget", type=int, help="most target steps of a run (default: the study's)")
     parser.add_argument("--no-oracle", action="store_true", help="leave the oracles out")
     parser.add_argument("--workers", type=int, default=2, help="runs side by side")
@@ -52,18 +52,18 @@ def main() -> None:
     for folder in (a.runs, out):
         folder.mkdir(parents=True, exist_ok=True)
 
+    # Tables and figure are always of all runs in the folder: "--seeds 0" writes them and runs nothing.
     todo = [job for job in study.jobs(a.tasks, a.shifts, a.targets, range(a.seeds)) if job.method in a.methods]
-    for task in a.tasks:
+    for task in dict.fromkeys(job.task for job in todo):
         study.source_agent(task, a.runs)
     with ProcessPoolExecutor(a.workers) as pool:
         places = [(job.task, job.shift, job.target) for job in todo]
-        bests = {} if a.no_oracle else {p: pool.submit(study.oracle, *p, a.runs) for p in dict.fromkeys(places)}
+        bests = [] if a.no_oracle else [pool.submit(study.oracle, *p, a.runs) for p in dict.fromkeys(places)]
         futures = [pool.submit(study.run, job, a.runs, a.budget, episodes) for job in todo]
-        for future in tqdm([*bests.values(), *futures], desc="runs"):
+        for future in tqdm([*bests, *futures], desc="runs"):
             future.result()
-    oracles = {place: future.result() for place, future in bests.items()}
 
-    rows = study.collected(a.runs)
+    rows, oracles = study.collected(a.runs), study.oracles(a.runs)
     rows.to_csv(out / "runs.csv", index=False)
     tables = {"summary": study.summary(rows, oracles), "steps_to_90": study.steps_to(rows, oracles)}
     if oracles:
@@ -71,11 +71,12 @@ def main() -> None:
         tables["oracles"] = pd.DataFrame(best)
     for name, table in tables.items():
         table.round(4).to_csv(out / f"{name}.csv", index=False)
-    settings = {k: v for k, v in vars(a).items() if k not in ("runs", "out", "workers")}
     packages = ("sb3-rpto", "torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
     manifest = {
         "command": "python examples/closed_loop_study.py" + (" --quick" if a.quick else ""),
-        "settings": settings,
+        "episodes": episodes,
+        "budget": a.budget,
+        "oracle steps": study.ORACLE_STEPS,
         "seeds run": {" ".join(map(str, p)): sorted(set(map(int, r["seed"]))) for p, r in rows.groupby(PLACE)},
         "targets": study.fingerprint(),
         "versions": {name: version(name) for name in packages},

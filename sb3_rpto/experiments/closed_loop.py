@@ -241,6 +241,13 @@ def oracle(task: str, shift: str, target: int, folder: Path, steps: int = ORACLE
     return float(json.loads(path.read_text())["return"])
 
 
+def oracles(folder: Path) -> dict[tuple[str, str, int], float]:
+    """All oracles of a folder: (task, shift, target) -> return."""
+    places = product(TASKS, SHIFTS, TARGETS)
+    files = {place: folder / f"oracle_{'_'.join(map(str, place))}.json" for place in places}
+    return {place: float(json.loads(p.read_text())["return"]) for place, p in files.items() if p.exists()}
+
+
 def collected(folder: Path) -> pd.DataFrame:
     """All rows of all finished runs."""
     names = {m.replace(" ", "-").replace(",", "") for m in METHODS}

@@ -106,4 +106,5 @@ def test_finished_runs_are_not_repeated_and_are_collected(tmp_path: Path) -> Non
     (tmp_path / "oracle_double-pendulum_none_0.json").write_text(json.dumps({"return": 2.0}))
     assert study.run(job, tmp_path) == path
     assert study.oracle("double-pendulum", "none", 0, tmp_path) == 2.0
+    assert study.oracles(tmp_path) == {("double-pendulum", "none", 0): 2.0}
     assert study.collected(tmp_path)["return"].tolist() == [1.0]
