@@ -13,6 +13,9 @@ from sb3_rpto.tracing.windows import Windows, cut, first_sample
 
 #: Horizons in s; the whole run comes after them.
 HORIZONS = (0.1, 0.5, 1.0)
+#: Predictions begin every fifth of a horizon: of few that lie side by side, where the first begins decides too much.
+OVERLAP = 0.8
+#: Most predictions of a horizon.
 MOST = 200
 RESAMPLES = 400
 #: Draws of the noise for each window of the floor: few windows of a long horizon say little by one draw each.
@@ -55,7 +58,7 @@ def horizon_errors(
     found = []
     for horizon in HORIZONS:
         try:
-            windows = cut(simulation.model, data, sigma, horizon, MOST)
+            windows = cut(simulation.model, data, sigma, horizon, MOST, OVERLAP)
         except ValueError:
             continue
         _, difference, usable = predictions(simulation, values, windows)
@@ -145,7 +148,7 @@ def noise_floor(
     found = []
     for horizon in HORIZONS:
         try:
-            windows = cut(simulation.model, data, sigma, horizon, MOST)
+            windows = cut(simulation.model, data, sigma, horizon, MOST, OVERLAP)
         except ValueError:
             continue
         problem = Problem(simulation, windows, [Scales()] * len(simulation.effects))

@@ -54,6 +54,15 @@ def test_a_model_that_lacks_a_torque_errs_by_the_known_parabola() -> None:
     assert found["whole run"].rmse[0] == pytest.approx(np.sqrt(np.mean(whole**2)), rel=0.01)
 
 
+def test_predictions_begin_every_fifth_of_a_horizon() -> None:
+    """So that where the first of few windows begins does not decide: 21 starts in 2.5 s, of an episode."""
+    data = recorded(noise=0.0, exact=True, duration=2.505)
+    simulation = Simulation(compiled(), [], 1)
+    found = {e.horizon: e.windows for e in horizon_errors(simulation, simulation.null, data, SIGMA, 0)}
+    assert found[0.5] == 21 * len(data.episodes)
+    assert found[1.0] == 8 * len(data.episodes)
+
+
 def test_a_constant_offset_of_what_was_measured_is_the_error() -> None:
     data = recorded(noise=0.0, exact=True)
     simulation = Simulation(compiled(), [], 1)
