@@ -59,7 +59,11 @@ def measure(out: str | os.PathLike[str], sets: int) -> str:
         rows.append(needed(list(SYSTEMS)[i % len(SYSTEMS)], NOISES[i // len(SYSTEMS) % len(NOISES)], FIRST + i))
         ts = [row["t"] for row in rows]
         summary = {"level": LEVEL, "quantile": float(np.quantile(ts, LEVEL)), "shipped": THRESHOLD}
-        made = {"command": f"{NAME} --sets {sets} --out {Path(out).as_posix()}", "commit": provenance.commit(), "versions": provenance.versions()}
+        made = {
+            "command": f"{NAME} --sets {sets} --out DIR",
+            "commit": provenance.commit(),
+            "versions": provenance.versions(),
+        }
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, json.dumps(summary | made | {"sets": rows}, indent=1) + "\n")
     ts = [row["t"] for row in rows[:sets]]
