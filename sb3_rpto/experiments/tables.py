@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -251,13 +252,18 @@ def _censored(cost: pd.Series) -> str:
     return f"{found} ({cost['reached']}/{cost['runs']})"
 
 
+def _by_number(level: str) -> list[int | str]:
+    """Sorts texts with numbers in them: 5 before 20."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", level)]
+
+
 def _effects(table: pd.DataFrame) -> str:
     last = table[table["steps"] == table["steps"].max()]
     tasks = sorted(set(last["task"]) - {"all"})
     grids = []
     for factor, part in last.groupby("factor", sort=False):
         lines = []
-        for level in dict.fromkeys(part["level"]):
+        for level in sorted(set(part["level"]), key=_by_number):
             mine = part[part["level"] == level].set_index("task")
             cells = _scores(mine, (*tasks, "all"))
             lines.append([level, str(mine.loc["all", "runs"]) if "all" in mine.index else "–", *cells])

@@ -227,11 +227,14 @@ def test_factors_are_averaged_over_cells(folder: Path) -> None:
 
 
 def test_a_factorial_suite_reports_its_factors(folder: Path) -> None:
+    labels = []
     for file in (folder / "runs").glob("*.json"):
         made = json.loads(file.read_text())
-        made["job"]["factors"] = {"kind": made["job"]["label"]}
+        labels.append(made["job"]["label"])
+        made["job"]["factors"] = {"kind": str(20 if labels[0] == labels[-1] else 5)}
         file.write_text(json.dumps(made))
     text = tables.write(folder)
+    assert text.index("| 5 | ") < text.index("| 20 | "), "levels in order, numbers by their size"
     assert "| kind | runs | score, Ant | score, Hopper | score, all |" in text
     assert len(pd.read_csv(folder / "effects.csv"))
 
