@@ -282,12 +282,15 @@ def summary(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float]) -> p
 
 
 def steps_to(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float], share: float = 0.9) -> pd.DataFrame:
-    """First evaluation at which each run reached a share of its oracle: quartiles over runs, and how many did."""
-    lines = []
+    """First evaluation at which each run reached a share of its oracle: quartiles over runs, and how many did.
+
+    Targets without an oracle are left out.
+    """
+    rows, lines = rows[[place in oracles for place in zip(rows.task, rows["shift"], rows.target)]], []
     for (task, shift, method), part in rows.groupby(["task", "shift", "method"], sort=False):
         reached = []
         for (target, _), one in part.groupby(["target", "seed"]):
-            enough = one[one["return"] >= share * oracles.get((task, shift, target), np.inf)]
+            enough = one[one["return"] >= share * oracles[task, shift, target]]
             reached.append(float(enough.steps.min()) if len(enough) else np.inf)
         q = np.quantile(np.array(reached), [0.25, 0.5, 0.75], method="nearest")
         line = {"task": task, "shift": shift, "method": method, "runs": len(reached)}

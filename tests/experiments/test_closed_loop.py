@@ -97,6 +97,7 @@ def test_steps_to_a_share_of_the_oracle() -> None:
     # 684 is reached at once by the third seed alone.
     assert (line["median"], line["reached"]) == (500, 3)
     assert study.steps_to(rows(), {("hopper", "none", 0): 2000.0}).iloc[0]["reached"] == 0
+    assert study.steps_to(rows(), {("hopper", "none", 1): 1.0}).empty, "of an unknown oracle nothing is said"
 
 
 def test_finished_runs_are_not_repeated_and_are_collected(tmp_path: Path) -> None:
