@@ -85,13 +85,28 @@ def test_committed_errors_are_those_of_the_committed_values(name: str) -> None:
         check(machine.other, "other")
 
 
-@pytest.mark.parametrize(
-    ("name", "what", "horizon", "measure"),
-    [pytest.param(*k, marks=MISSED) if k[:2] == ("double_pendulum", "test") else k for k in FIRST_ATTEMPT],
-)
-def test_a_first_attempt_is_reached_or_within_the_interval(name: str, what: str, horizon: str, measure: str) -> None:
+def first_attempts() -> list:
+    """Each joint by itself, so that the one figure that is missed hides no other."""
+    places = [(*place, joint) for place, reached in FIRST_ATTEMPT.items() for joint in range(len(reached))]
+    shoulder = ("double_pendulum", "test", "0.5", "rmse", 0)
+    return [pytest.param(*place, marks=MISSED if place == shoulder else ()) for place in places]
+
+
+def declared_and_corrected(name: str, what: str, horizon: str, joint: int) -> list[dict[str, str]]:
     rows = [r for r in committed(name)[1] if (r["data"], r["horizon"]) == (what, horizon)]
-    before, after = ([r for r in rows if r["model"] == model] for model in ("declared", "corrected"))
-    for old, new, first in zip(before, after, FIRST_ATTEMPT[name, what, horizon, measure], strict=True):
+    return [[r for r in rows if r["model"] == model][joint] for model in ("declared", "corrected")]
+
+
+@pytest.mark.parametrize(("name", "what", "horizon", "measure", "joint"), first_attempts())
+def test_a_first_attempt_is_reached_or_within_the_interval(
+    name: str, what: str, horizon: str, measure: str, joint: int
+) -> None:
+    _, new = declared_and_corrected(name, what, horizon, joint)
+    assert min(float(new["low"]), float(new[measure])) <= FIRST_ATTEMPT[name, what, horizon, measure][joint]
+
+
+@pytest.mark.parametrize(("name", "what", "horizon", "measure"), FIRST_ATTEMPT)
+def test_a_quarter_of_every_joints_error_is_taken_away(name: str, what: str, horizon: str, measure: str) -> None:
+    for joint in range(len(FIRST_ATTEMPT[name, what, horizon, measure])):
+        old, new = declared_and_corrected(name, what, horizon, joint)
         assert float(new[measure]) < 0.75 * float(old[measure])
-        assert min(float(new["low"]), float(new[measure])) <= first
