@@ -25,8 +25,11 @@ if TYPE_CHECKING:
 
 #: Target transitions before the first trace, and new ones before another.
 FIRST, AGAIN = 200, 200
-#: Another trace is due when the one-step error of new transitions is so many times that after the last.
-RISEN = 2.0
+#: Another trace is due when the one-step error of new transitions is so many times that after the last, and, where the
+#: last one did not account for everything, when there are so many times as many transitions.
+RISEN, MORE = 2.0, 2
+#: Verdicts that leave nothing to look for.
+SETTLED = ("complete", "explained")
 #: Samples in a window: several steps show what acts late, and contacts do not amplify errors yet.
 WINDOW = 4
 #: What is found is kept when the one-step error falls below this share of the best without it.
@@ -70,7 +73,7 @@ class LoopCloser:
         self._traced_at, self._error = None, math.inf
 
     def due(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
-        """Whether enough was seen for a first trace, or what is new is no longer predicted."""
+        """Whether enough was seen for a first trace, for a better one than the last, or is no longer predicted."""
         buffer = model.replay_buffer
         size, capacity = buffer.target.size(), buffer.target.buffer_size
         if self._traced_at is None:
@@ -80,6 +83,8 @@ class LoopCloser:
         new = min(buffer.target_added - self._traced_at, size)
         if new < min(AGAIN, capacity):
             return False
+        if self.found[-1]["verdict"] not in SETTLED and buffer.target_added >= MORE * self._traced_at:
+            return True
         return dynamics.error(model.transitions("target").take(slice(size - new, None))) > RISEN * self._error
 
     def close(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:

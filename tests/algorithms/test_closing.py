@@ -240,6 +240,21 @@ def test_another_trace_is_due_when_new_transitions_are_no_longer_predicted(
     assert loop.due(made, dynamics(made))
 
 
+@pytest.mark.parametrize(("verdict", "due"), [("unexplained", True), ("partly explained", True), ("explained", False)])
+def test_what_was_not_explained_is_looked_for_again_in_twice_as_many_transitions(
+    soon: None, verdict: str, due: bool
+) -> None:
+    made = filled(friction())
+    loop = made.loop
+    assert isinstance(loop, LoopCloser)
+    loop.close(made, dynamics(made))
+    loop.found[-1]["verdict"] = verdict
+    append(made, friction(), 99)
+    assert not loop.due(made, dynamics(made))
+    append(made, friction(), 110)
+    assert loop.due(made, dynamics(made)) == due
+
+
 def test_a_new_target_is_traced_anew(soon: None) -> None:
     made = filled(friction())
     assert made.loop is not None
