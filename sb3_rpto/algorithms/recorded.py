@@ -22,17 +22,8 @@ from sb3_rpto.envs.rules import Rule, task_rules
 from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Episode, Measurements
 from sb3_rpto.tracing.model_checks import check_names
-from sb3_rpto.tracing.windows import (
-    HALF_COUNT,
-    HALF_WIDTH,
-    command_order,
-    half_step,
-    held,
-    noise_levels,
-    scalar_joints,
-    start_state,
-    velocity_addresses,
-)
+from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, half_step, start_state, straight
+from sb3_rpto.tracing.windows import command_order, held, noise_levels
 
 #: Observation wrappers whose answer depends on more than the observation.
 REMEMBERING = (wrappers.DelayObservation, wrappers.TimeAwareObservation, wrappers.NormalizeObservation)
@@ -75,7 +66,7 @@ def transitions(
     """The steps that the environment would have taken where the log was recorded.
 
     Each episode is laid on a grid of ``env.unwrapped.dt``, begun where commands change the least within a step. The
-    states there are smoothed (:func:`~sb3_rpto.tracing.windows.smoothed_state`; exact data as they are) and
+    states there are smoothed (:func:`~sb3_rpto.tracing.starts.smoothed_state`; exact data as they are) and
     interpolated between samples; actions are the mean command over a step; observations are those of a copy of the
     environment in these states. A step that holds a sample which is not usable, or an actuator switched off, is left
     out, and so is one that begins where the task is over.
@@ -124,10 +115,9 @@ class _Log:
         self.measured, self.model, self.dt = measured, model, dt
         self.sigma = noise_levels(measured)
         self.addresses = names_of(model, measured.columns.qpos)
-        self.dofs = velocity_addresses(model, measured)
         self.order = np.argsort(command_order(model, measured))
-        joints = scalar_joints(model)
-        self.scalar = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+        pairs = straight(model)
+        self.straight = np.array(list(pairs), dtype=int), np.array(list(pairs.values()), dtype=int)
 
     def steps(self, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """States, the commands before them, and which steps are whole.
@@ -179,7 +169,7 @@ class _Log:
         states = [start_state(self.model, self.measured, episode, i, self.sigma, self.addresses)[:2] for i in rows]
         q, v = (np.array(part) for part in zip(*states))
         qpos, qvel = (np.stack([np.interp(nodes, time[rows], c) for c in part.T], axis=1) for part in (q, v))
-        of_qpos, of_qvel = self.scalar
+        of_qpos, of_qvel = self.straight
         curve = CubicHermiteSpline(time[rows], q[:, of_qpos], v[:, of_qvel])
         qpos[:, of_qpos], qvel[:, of_qvel] = curve(nodes), curve(nodes, 1)
         return qpos, qvel

@@ -10,6 +10,7 @@ import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.tracing.box import bounded_step
+from sb3_rpto.tracing.starts import moved, straight
 from sb3_rpto.tracing.windows import Windows
 
 #: Where a simulation became unstable, its residual in units of the noise.
@@ -128,10 +129,7 @@ class Problem:
     def _predict(self, values: np.ndarray, starts: np.ndarray, index: np.ndarray) -> np.ndarray:
         w, model = self.windows, self.simulation.model
         shift = starts * w.spread[index] * TRUST
-        qpos, qvel = w.qpos[index].copy(), w.qvel[index] + shift[:, model.nv :]
-        for joint in range(model.njnt):
-            # Only scalar joints have a spread, see start_state.
-            qpos[:, model.jnt_qposadr[joint]] += shift[:, model.jnt_dofadr[joint]]
+        qpos, qvel = moved(model, w.qpos[index], shift[:, : model.nv]), w.qvel[index] + shift[:, model.nv :]
         self.simulation.undo_sensors(values, qpos, qvel, w.qacc[index])
         q, v = self.simulation.rollout(values, qpos, qvel, w.drive.take(index))
         dt, dofs = float(model.opt.timestep), self._dofs()
@@ -149,10 +147,7 @@ class Problem:
 
     def _dofs(self) -> np.ndarray:
         """Address in qvel of each observed column, -1 for a coordinate without a velocity of its own."""
-        model = self.simulation.model
-        dof_of = {
-            int(model.jnt_qposadr[j]): int(model.jnt_dofadr[j]) for j in range(model.njnt) if model.jnt_type[j] > 1
-        }
+        dof_of = straight(self.simulation.model)
         return np.array([dof_of.get(int(c), -1) for c in self.windows.columns])
 
     def residuals(self, values: np.ndarray, starts: np.ndarray, index: np.ndarray) -> np.ndarray:

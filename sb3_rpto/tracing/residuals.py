@@ -15,7 +15,8 @@ from sb3_rpto.effects.world import BatchWorld, LiveWorld
 from sb3_rpto.tracing.checks import MIN_ROWS
 from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.windows import command_order, scalar_joints, velocity_addresses
+from sb3_rpto.tracing.starts import straight, velocity_addresses
+from sb3_rpto.tracing.windows import command_order
 
 #: Cut-off of the zero-phase low pass in Hz; lower where the sampling asks for it.
 CUTOFF = 15.0
@@ -64,7 +65,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     h = float(np.median(np.diff(e.time)))
     time = np.arange(e.time[0], e.time[-1], h)
     addresses = names_of(nominal, data.columns.qpos)
-    scalar = {int(nominal.jnt_qposadr[j]): int(nominal.jnt_dofadr[j]) for j in scalar_joints(nominal)}
+    dof_of = straight(nominal)
     qpos = np.tile(nominal.qpos0, (len(time), 1))
     qvel = np.zeros((len(time), nominal.nv))
     shown = np.zeros((len(time), nominal.nv))
@@ -72,12 +73,12 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     for column, address in enumerate(addresses):
         path = low(np.interp(time, e.time, e.qpos[:, column]))
         qpos[:, address] = path
-        if int(address) in scalar:
-            dof = scalar[int(address)]
+        if int(address) in dof_of:
+            dof = dof_of[int(address)]
             shown[:, dof] = path
             qvel[:, dof] = np.gradient(path, h)
     for column, dof in enumerate(velocity_addresses(nominal, data)):
-        if data.exact or dof not in scalar.values():  # quaternions are not differentiated
+        if data.exact or dof not in dof_of.values():  # quaternions are not differentiated
             qvel[:, dof] = low(np.interp(time, e.time, e.qvel[:, column]))
     active = [
         (effect, values[None, s])

@@ -10,11 +10,12 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects import Drive
-from sb3_rpto.effects.names import SCALAR_JOINTS, object_id, object_names
+from sb3_rpto.effects.names import object_id
 from sb3_rpto.effects.simulation import memory, names_of
 from sb3_rpto.tracing import checks
 from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, half_step, start_state
 
 #: Seconds of commands kept from before a window, for effects that delay and filter: four constants of the slowest lag.
 MEMORY = 1.0
@@ -26,8 +27,6 @@ BLOCK = 1.0
 LONGEST = 0.002
 #: The Runge-Kutta method is stable up to 2.8 for the product of a step and the model's fastest rate; poses differ.
 STIFF = 2.0
-#: Half the time, in s, over which the state at a window's start is smoothed, and the fewest samples on each side.
-HALF_WIDTH, HALF_COUNT = 0.025, 4
 
 
 @dataclass(frozen=True)
@@ -112,40 +111,6 @@ def _difference_noise(episodes: Sequence[Episode], column: int, order: int) -> f
     # know but a few values of a rounded signal.
     squares = np.sort(np.concatenate(found) ** 2)
     return float(np.sqrt(squares[: max(1, round(0.95 * len(squares)))].mean() / 0.7588))
-
-
-def half_step(model: mujoco.MjModel) -> float:
-    """By how much, in s, velocities and commands lead positions in the model's integrator.
-
-    Semi-implicit integrators move positions by the new velocity: as in the leapfrog scheme a velocity belongs half a
-    step before its position, and a command acts from half a step before its instant. Seen so they are of second order.
-    """
-    return 0.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5 * float(model.opt.timestep)
-
-
-def smoothed_state(
-    episode: Episode, index: int, sigma: np.ndarray, lead: float = 0.0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Position, velocity and acceleration of the scalar columns at a sample by a local cubic in time, and the spread.
-
-    :param index: of the sample
-    :param sigma: noise of the position columns, (m,)
-    :param lead: velocities are those of so many s before the sample
-    :return: positions (m,), velocities (m,), accelerations (m,), standard deviations of the first two (2, m)
-    """
-    step = float(np.median(np.diff(episode.time)))
-    half = max(HALF_COUNT, round(HALF_WIDTH / step))
-    first, last = max(0, index - half), min(len(episode), index + half + 1)
-    t = episode.time[first:last] - episode.time[index]
-    scale = np.abs(t).max()
-    basis = np.vander(t / scale, 4, increasing=True)
-    inverse = np.linalg.pinv(basis)
-    coefficients = inverse @ episode.qpos[first:last]
-    spread = np.sqrt(np.sum(inverse[:2] ** 2, axis=1))[:, None] * sigma
-    z = -lead / scale
-    velocity = (coefficients[1] + 2 * z * coefficients[2] + 3 * z**2 * coefficients[3]) / scale
-    acceleration = (2 * coefficients[2] + 6 * z * coefficients[3]) / scale**2
-    return coefficients[0], velocity, acceleration, spread / np.array([[1.0], [scale]])
 
 
 def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco.MjModel:
@@ -329,47 +294,6 @@ def held(time: np.ndarray, ctrl: np.ndarray, edges: np.ndarray) -> np.ndarray:
     impulse = np.concatenate([np.zeros((1, ctrl.shape[1])), np.cumsum(levels * np.diff(knots)[:, None], axis=0)])
     reached = np.stack([np.interp(edges, knots, column) for column in impulse.T], axis=1).reshape(len(edges), -1)
     return np.diff(reached, axis=0) / np.diff(edges)[:, None]
-
-
-def start_state(
-    model: mujoco.MjModel, data: Measurements, episode: Episode, index: int, sigma: np.ndarray, addresses: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The state of the model at a sample: qpos (nq,), qvel (nv,), qacc (nv,), spread (2 nv,)."""
-    qpos, (qvel, qacc), spread = model.qpos0.copy(), np.zeros((2, model.nv)), np.zeros(2 * model.nv)
-    dofs = velocity_addresses(model, data)
-    if data.exact:
-        qpos[addresses] = episode.qpos[index]
-        qvel[dofs] = episode.qvel[index]
-        if index + 1 < len(episode):
-            after = episode.qvel[index + 1] - episode.qvel[index]
-            qacc[dofs] = after / (episode.time[index + 1] - episode.time[index])
-        return qpos, qvel, qacc, spread
-    position, velocity, acceleration, deviation = smoothed_state(episode, index, sigma, half_step(model))
-    qpos[addresses] = position
-    scalar = {int(model.jnt_qposadr[j]): int(model.jnt_dofadr[j]) for j in scalar_joints(model)}
-    if len(scalar) < model.njnt:
-        qvel[dofs] = episode.qvel[index]
-    for i, address in enumerate(addresses):
-        if int(address) in scalar:
-            dof = scalar[int(address)]
-            qvel[dof], qacc[dof] = velocity[i], acceleration[i]
-            spread[[dof, model.nv + dof]] = deviation[:, i]
-    return qpos, qvel, qacc, spread
-
-
-def scalar_joints(model: mujoco.MjModel) -> list[int]:
-    """Ids of hinges and slides."""
-    return [j for j in range(model.njnt) if model.jnt_type[j] in SCALAR_JOINTS]
-
-
-def velocity_addresses(model: mujoco.MjModel, data: Measurements) -> np.ndarray:
-    """Addresses in qvel of the data's velocity columns."""
-    joints = object_names(model, "joint")
-    out = []
-    for name in data.columns.qvel:
-        joint, offset = (name, 0) if name in joints else (name.rpartition(".")[0], int(name.rpartition(".")[2]))
-        out.append(int(model.jnt_dofadr[joints.index(joint)]) + offset)
-    return np.array(out, dtype=int)
 
 
 def command_order(model: mujoco.MjModel, data: Measurements) -> list[int]:

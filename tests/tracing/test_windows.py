@@ -10,9 +10,8 @@ from simulated import PENDULUM, compiled, recorded
 from sb3_rpto.effects import Simulation
 from sb3_rpto.effects.names import object_id
 from sb3_rpto.tracing import Measurements
-from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.identify import interpolate
-from sb3_rpto.tracing.windows import EXACT, cut, discretised, noise_levels, smoothed_state
+from sb3_rpto.tracing.windows import EXACT, cut, discretised, noise_levels
 
 SIGMA = np.array([1e-3])
 
@@ -91,38 +90,6 @@ def test_noise_is_that_of_each_column() -> None:
     assert noise_levels(Measurements.from_tables(tables)) == pytest.approx([1e-3, 4e-3], rel=0.1)
 
 
-# --- smoothed state ---------------------------------------------------------------------------------------------------
-
-
-def episode(time: np.ndarray, q: np.ndarray) -> Episode:
-    empty = np.empty((len(time), 0))
-    return Episode("e", "e", time, q, np.zeros_like(q), empty, empty, empty.astype(bool))
-
-
-@pytest.mark.parametrize("jitter", [0.0, 0.8])
-@pytest.mark.parametrize("index", [0, 2, 30, 59])
-def test_smoothing_leaves_a_cubic_and_its_derivative_as_they_are(jitter: float, index: int) -> None:
-    t = clock(60, 200.0, jitter)
-    c = np.array([[0.3, -1.0], [2.0, 0.5], [-40.0, 9.0], [300.0, -70.0]])
-    powers = t[:, None] ** np.arange(4)
-    q, v, a, _ = smoothed_state(episode(t, powers @ c), index, np.array([1e-3, 1e-3]))
-    np.testing.assert_allclose(q, powers[index] @ c, atol=1e-11)
-    np.testing.assert_allclose(v, powers[index, :3] @ (c[1:] * np.arange(1, 4)[:, None]), atol=1e-9)
-    np.testing.assert_allclose(a, 2 * c[2] + 6 * t[index] * c[3], atol=1e-7)
-
-
-@pytest.mark.parametrize("index", [0, 20])
-def test_spread_of_the_smoothed_state_is_that_of_repeated_noise(index: int) -> None:
-    rng, sigma = np.random.default_rng(0), np.array([1e-3, 5e-3])
-    t = clock(41, 200.0, 0.5)
-    # As many columns as draws: all are smoothed at once.
-    draws = rng.standard_normal((len(t), 2, 3000)) * sigma[:, None]
-    q, v, _, _ = smoothed_state(episode(t, draws.reshape(len(t), -1)), index, np.ones(6000))
-    *_, spread = smoothed_state(episode(t, draws[:, :, 0]), index, sigma)
-    np.testing.assert_allclose(spread[0], q.reshape(2, -1).std(1), rtol=0.05)
-    np.testing.assert_allclose(spread[1], v.reshape(2, -1).std(1), rtol=0.05)
-
-
 # --- cutting ----------------------------------------------------------------------------------------------------------
 
 
@@ -158,7 +125,8 @@ def test_semi_implicit_steps_are_of_second_order_from_where_they_have_their_velo
 ) -> None:
     data = recorded(noise=0.0, duration=3.1)
     exact, found = predicted(data, "RK4"), predicted(data, integrator)
-    monkeypatch.setattr("sb3_rpto.tracing.windows.half_step", lambda model: 0.0)
+    for module in ("starts", "windows"):
+        monkeypatch.setattr(f"sb3_rpto.tracing.{module}.half_step", lambda model: 0.0)
     first_order = np.abs(predicted(data, integrator) - exact)
     np.testing.assert_array_equal(predicted(data, "RK4"), exact)
     assert np.median(first_order) > 1e-3
