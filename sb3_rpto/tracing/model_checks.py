@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -12,6 +12,7 @@ from scipy.ndimage import binary_erosion
 from scipy.signal import savgol_filter
 
 from sb3_rpto.effects import Declared
+from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.simulation import FILTERS
 from sb3_rpto.tracing.checks import WINDOW, Finding, smoothed_velocity
 from sb3_rpto.tracing.columns import columns_of, joint_of
@@ -23,6 +24,8 @@ SLOW = 0.02
 """A machine sampled at longer steps than this, in s, is said to be sampled slowly."""
 LONGEST_STEP, MOST_SUBSTEPS = 0.5, 500
 """Samples farther apart than this in s, and than so many steps of the model, are taken for times in another unit."""
+SOFT = 0.005
+"""Dry friction with a longer time constant than this, in s, creeps by more than the noise (MuJoCo's default: 0.02)."""
 LAG = 2
 """A response that is later than this many samples is reported."""
 SMOOTHING = 0.06
@@ -109,6 +112,24 @@ def _check_actuators(model: mujoco.MjModel) -> None:
                 f"actuator {name!r} has a state of its own (dyntype {kind}) that no column holds and no commands tell; "
                 "model it without, and give what it puts out as its command"
             )
+
+
+def soft_friction(model: mujoco.MjModel, declared: Sequence[str]) -> list[Finding]:
+    """Joints with dry friction, in the model or declared, that creeps for longer than the model's steps make it.
+
+    :param declared: names of declared parameters
+    """
+    found = []
+    for joint, name in enumerate(object_names(model, "joint")):
+        dof = model.jnt_dofadr[joint]
+        rubs = model.dof_frictionloss[dof] > 0 or f"{name}.frictionloss" in [d.split(":")[-1] for d in declared]
+        if rubs and model.dof_solref[dof, 0] > SOFT:
+            message = (
+                f"dry friction gives way over some {1e3 * model.dof_solref[dof, 0]:g} ms (its solreffriction); a "
+                'machine\'s holds: set solreffriction="0.001 1" solimpfriction="0.99 0.99" in the model'
+            )
+            found.append(Finding("soft friction", f"joint {name}", message))
+    return found
 
 
 def _check_clock(model: mujoco.MjModel, data: Measurements) -> None:

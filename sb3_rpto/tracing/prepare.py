@@ -14,7 +14,7 @@ from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.model_checks import check_against
+from sb3_rpto.tracing.model_checks import check_against, soft_friction
 from sb3_rpto.tracing.origin import origin
 from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.search import Selectors
@@ -30,6 +30,8 @@ OVERLAP = 2 / 3
 SHORT = 15.0
 #: Fewer windows than this overlap.
 FEW = 40
+#: Where steps in time seem to err by more than the noise, others so many times as short are tried.
+SHORTER = 4
 #: Where what is found leaves errors far above the noise, windows so many times as long show more of what is missing,
 #: and what only stands in for it shows too.
 LONGER = 2
@@ -77,6 +79,16 @@ class SetUp:
         )
         return Selectors(fine, rough, say)
 
+    def finer(self, horizon: float, say: Progress) -> Selectors | None:
+        """The same with shorter steps to judge with; None for what comes from a simulator's own steps."""
+        if self.fitted.exact or self.fitted.simulated:
+            return None
+        nominal = self.fine.model.__copy__()
+        nominal.opt.timestep /= SHORTER
+        simulation = Simulation(nominal, self.fine.effects, self.fine.nthread)
+        fine = Selector.on(simulation, self._windows(nominal, horizon), self.scales, horizon, say)
+        return replace(self.selectors(horizon, say), fine=fine)
+
     def _windows(self, model: mujoco.MjModel, horizon: float) -> tuple[Windows, Windows | None]:
         return windows(model, self.train, self.select, self.sigma, horizon, 1 - self.length / horizon)
 
@@ -113,6 +125,8 @@ def prepare(
         findings.append(Finding("simulated", "fitted runs", message))
     nominal = discretised(compiled, fitted, fine=True)
     known = declare(nominal, declared)
+    if seems == "machine":
+        findings += soft_friction(nominal, [d.label for d in known])
     settings = {Declared(nominal, name, (-np.inf, np.inf)).number: name for name in data.columns.params}
     for one in known:
         if one.number in settings:

@@ -18,6 +18,8 @@ from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
 
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
+#: Finer steps in time are taken where they lower R by this share: then the steps, not the model, make it.
+FINER = 0.03
 
 
 @dataclass(frozen=True)
@@ -55,11 +57,17 @@ class Found:
 
 
 def find(
-    selectors: Callable[[float], Selectors], length: float, longer: float | None, seed: int, calibrate: int
+    selectors: Callable[[float], Selectors],
+    finer: Callable[[float], Selectors | None],
+    length: float,
+    longer: float | None,
+    seed: int,
+    calibrate: int,
 ) -> Found:
     """Fit what is declared; where that is not enough, search, and where much is left, go on with longer windows.
 
     :param selectors: on windows of a length in s
+    :param finer: the same with finer steps in time; None where there are none to take
     :param length: of the windows
     :param longer: of the windows to go on with; None: there are none
     :param seed: of the starts and the resampling
@@ -68,7 +76,7 @@ def find(
     on = selectors(length)
     on.say(0.05, "fitting the declared parameters")
     base = on.fine.model((), fit_declared(on.rough, seed), iterations=10)
-    before = judged(on.fine, base, seed)
+    on, base, before = closely(on, base, judged(on.fine, base, seed), finer, seed)
     if before.adequate:
         return Found(on, base, before, None, Selection(base), before)
     on = aligned(on, base.fit.values)
@@ -88,7 +96,32 @@ def find(
             on, selection = then, more
             base = on.fine.model((), on.fine.train.score(base.fit.values), iterations=10)
             before = judged(on.fine, base, seed)
-    return Found(on, base, before, screening, selection, judged(on.fine, selection.model, seed))
+    then, selection.model, after = closely(on, selection.model, judged(on.fine, selection.model, seed), finer, seed)
+    if then is not on:
+        on, base = then, then.fine.model((), base.fit, iterations=10)
+        before = judged(on.fine, base, seed)
+    return Found(on, base, before, screening, selection, after)
+
+
+def closely(
+    on: Selectors, model: Model, seen: Adequacy, finer: Callable[[float], Selectors | None], seed: int
+) -> tuple[Selectors, Model, Adequacy]:
+    """Judge a model that does not seem adequate with finer steps, and go on with them where they err less.
+
+    At a kink of the motion, where dry friction sets in or a contact, every method is of first order.
+
+    :param on: windows
+    :param model: fitted there
+    :param seen: its adequacy
+    :param finer: as in :func:`find`
+    :param seed: of the resampling
+    """
+    then = None if seen.adequate else finer(on.fine.horizon)
+    if then is None or not judged(then.fine, model, seed).ratio < (1 - FINER) * seen.ratio:
+        return on, model, seen
+    then.fine.threshold = then.rough.threshold = on.fine.threshold
+    model = then.fine.model(model.effects, model.fit, iterations=10)
+    return then, model, judged(then.fine, model, seed)
 
 
 def aligned(on: Selectors, values: np.ndarray) -> Selectors:

@@ -66,10 +66,24 @@ def trace(
     _check_arguments(seed, candidates, horizon, calibrate, threads)
     say = _steady(progress)
     set_up = prepare(model, data, declared, seed, candidates, horizon, threads)
-    simulation, sigma, fitted = set_up.fine, set_up.sigma, set_up.fitted
-    found = find(lambda length: set_up.selectors(length, say), set_up.length, set_up.longer, seed, calibrate)
+    sigma, fitted = set_up.sigma, set_up.fitted
+    found = find(
+        lambda length: set_up.selectors(length, say),
+        lambda length: set_up.finer(length, say),
+        set_up.length,
+        set_up.longer,
+        seed,
+        calibrate,
+    )
     selector, selection = found.on.fine, found.selection
-    findings = set_up.findings
+    simulation, findings = selector.simulation, set_up.findings
+    step, usual = (1e3 * float(s.model.opt.timestep) for s in (simulation, set_up.fine))
+    if step < usual:
+        message = (
+            f"judged with steps of {step:g} ms: longer ones err by a good part of what is left (dry friction and "
+            "contacts are kinks); the corrected simulator errs less with a smaller timestep, too"
+        )
+        findings.append(Finding("time step", "model", message))
     if selector.select is None:
         count = len(selector.train.windows)
         message = f"selected on {count} windows of the training runs by cross-validation over blocks"

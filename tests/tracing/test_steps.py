@@ -1,0 +1,76 @@
+"""Steps in time that err by more than the noise do not pass for something that the model lacks."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from sb3_rpto.tracing import Measurements, trace
+from sb3_rpto.tracing.model_checks import soft_friction
+from sb3_rpto.tracing.prepare import SetUp
+
+CRANK = """
+<mujoco><option timestep="0.002"/><worldbody><body name="crank">
+  <joint name="crank" axis="0 1 0" damping="0.05" {friction}/>
+  <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.6"/>
+</body></worldbody><actuator><motor name="motor" joint="crank"/></actuator></mujoco>
+"""
+# As hard as dry friction is; MuJoCo's usual one gives way over many milliseconds.
+HARD = 'frictionloss="0.25" solreffriction="0.0008 1" solimpfriction="0.999 0.9999 0.001"'
+
+
+@pytest.fixture(scope="module")
+def rubbing() -> Measurements:
+    model, rng, tables = mujoco.MjModel.from_xml_string(CRANK.format(friction=HARD)), np.random.default_rng(1), {}
+    model.opt.timestep, model.opt.integrator = 2e-4, int(mujoco.mjtIntegrator.mjINT_RK4)
+    for run in range(5):
+        data, t = mujoco.MjData(model), np.arange(750) / 250
+        frequencies, phases = rng.uniform(0.3, 2.5, (4, 1)), rng.uniform(0, 6.28, (4, 1))
+        torque, position = np.sin(2 * np.pi * frequencies * t + phases).sum(0), []
+        for now in torque:
+            position.append(data.qpos[0])
+            data.ctrl[0] = now
+            mujoco.mj_step(model, data, 20)
+        noisy = np.array(position) + 1e-3 * rng.standard_normal(len(t))
+        tables[f"run{run}"] = {"time": t, "qpos.crank": noisy, "ctrl.motor": torque}
+    return Measurements.from_tables(tables)
+
+
+def test_dry_friction_is_judged_with_steps_that_meet_its_kinks(rubbing: Measurements) -> None:
+    model = CRANK.format(friction="")
+    report = trace(model, rubbing, ["crank.damping"], candidates=["coulomb_friction"], threads=1)
+    assert report.verdict == "explained"
+    assert [t.label for t in report.effects] == ["coulomb_friction(crank)"]
+    assert report.effects[0].effect.values == pytest.approx([0.25], rel=0.02)
+    assert [f.where for f in report.findings if f.kind == "time step"] == ["model"]
+
+
+def test_a_rubbing_machine_whose_friction_is_declared_is_complete(rubbing: Measurements) -> None:
+    model = CRANK.format(friction='frictionloss="0.1" solreffriction="0.001 1" solimpfriction="0.99 0.99"')
+    declared = ["crank.damping", "crank.frictionloss"]
+    report = trace(model, rubbing, declared, candidates=["coulomb_friction"], threads=1)
+    assert report.verdict == "complete"
+    assert not [f for f in report.findings if f.kind == "soft friction"]
+
+
+@pytest.mark.parametrize(("friction", "declared"), [('frictionloss="0.1"', []), ("", ["crank.frictionloss"])])
+def test_friction_that_creeps_is_said_to(friction: str, declared: list[str]) -> None:
+    model = mujoco.MjModel.from_xml_string(CRANK.format(friction=friction))
+    assert [f.where for f in soft_friction(model, declared)] == ["joint crank"]
+    assert not soft_friction(mujoco.MjModel.from_xml_string(CRANK.format(friction="")), ["crank.damping"])
+
+
+def test_finer_steps_are_not_taken_where_the_model_is_adequate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SetUp, "finer", lambda *_: pytest.fail("nothing is missing"))
+    model, rng, tables = mujoco.MjModel.from_xml_string(CRANK.format(friction="")), np.random.default_rng(0), {}
+    model.opt.timestep = 2e-4
+    for run in range(4):
+        data, position = mujoco.MjData(model), []
+        data.qpos[0] = rng.uniform(-2, 2)
+        for _ in range(500):
+            position.append(data.qpos[0])
+            mujoco.mj_step(model, data, 20)
+        noisy = np.array(position) + 1e-3 * rng.standard_normal(500)
+        tables[f"run{run}"] = {"time": np.arange(500) / 250, "qpos.crank": noisy, "ctrl.motor": np.zeros(500)}
+    data = Measurements.from_tables(tables)
+    report = trace(CRANK.format(friction=""), data, ["crank.damping"], candidates=["coulomb_friction"], threads=1)
+    assert report.verdict == "complete"
