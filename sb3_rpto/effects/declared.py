@@ -29,7 +29,11 @@ class _Kind(NamedTuple):
     span: tuple[float, float] | None = None  # default bounds as multiples of the nominal value; None: [0, inf)
 
 
-def _dof(name: str) -> tuple[Callable[[mujoco.MjModel, int], float], Callable[[World, int, np.ndarray, float], None]]:
+_Read = Callable[[mujoco.MjModel, int], float]
+_Write = Callable[[World, int, np.ndarray, float], None]
+
+
+def _dof(name: str) -> tuple[_Read, _Write]:
     def read(model: mujoco.MjModel, joint: int) -> float:
         return float(getattr(model, name)[model.jnt_dofadr[joint]])
 
@@ -44,9 +48,7 @@ def _dof(name: str) -> tuple[Callable[[mujoco.MjModel, int], float], Callable[[W
     return read, write
 
 
-def _column(
-    name: str, column: int | None = None
-) -> tuple[Callable[[mujoco.MjModel, int], float], Callable[[World, int, np.ndarray, float], None]]:
+def _column(name: str, column: int | None = None) -> tuple[_Read, _Write]:
     def read(model: mujoco.MjModel, index: int) -> float:
         values = getattr(model, name)[index]
         return float(values if column is None else values[column])
@@ -70,10 +72,38 @@ def _write_inertia(world: World, body: int, values: np.ndarray, nominal: float) 
     inertia *= (values / inertia[:, 0])[:, None]
 
 
+def _servo(model: mujoco.MjModel, actuator: int) -> str:
+    """What an actuator regulates: its bias takes back its gain on the position, ``kp (u - q)``, or on the velocity."""
+    gain, (_, on_position, on_velocity) = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, :3]
+    if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE and gain:
+        if on_position == -gain:
+            return "position"
+        if on_velocity == -gain and not on_position:
+            return "velocity"
+    return ""
+
+
+def _read_kp(model: mujoco.MjModel, actuator: int) -> float:
+    if _servo(model, actuator) != "position":
+        raise ValueError("the actuator is no position servo; declare its gain, kv or strength")
+    return float(model.actuator_gainprm[actuator, 0])
+
+
 def _write_kp(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
     world.field("actuator_gainprm")[:, actuator, 0] = values
-    if world.model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
-        world.field("actuator_biasprm")[:, actuator, 1] = -values
+    world.field("actuator_biasprm")[:, actuator, 1] = -values
+
+
+def _read_kv(model: mujoco.MjModel, actuator: int) -> float:
+    if not _servo(model, actuator):
+        raise ValueError("the actuator is no position or velocity servo; declare its gain, damping or strength")
+    return -float(model.actuator_biasprm[actuator, 2])
+
+
+def _write_kv(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
+    if _servo(world.model, actuator) == "velocity":
+        world.field("actuator_gainprm")[:, actuator, 0] = values
+    world.field("actuator_biasprm")[:, actuator, 2] = -values
 
 
 def _write_strength(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
@@ -124,7 +154,8 @@ _KINDS: dict[str, dict[str, _Kind]] = {
     "actuator": {
         "gear": _Kind("", *_column("actuator_gear", 0), lambda s: 1.0, _POSITIVE),
         "gain": _Kind("", *_column("actuator_gainprm", 0), lambda s: 1.0, _POSITIVE),
-        "kp": _Kind("N·m/rad", *_column("actuator_gainprm", 0)[:1], _write_kp, lambda s: 1.0, _POSITIVE),
+        "kp": _Kind("N·m/rad", _read_kp, _write_kp, lambda s: 1.0, _POSITIVE),
+        "kv": _Kind("N·m·s/rad", _read_kv, _write_kv, _viscous_size),
         "strength": _Kind("", _one, _write_strength, lambda s: 1.0, _POSITIVE),
         "damping": _Kind("N·m·s/rad", *_column("actuator_damping"), _viscous_size),
     },
@@ -135,9 +166,7 @@ def _write_gravity(world: World, index: int, values: np.ndarray, nominal: float)
     world.field("opt.gravity")[:] *= (values / nominal)[:, None]
 
 
-def _option(
-    name: str,
-) -> tuple[Callable[[mujoco.MjModel, int], float], Callable[[World, int, np.ndarray, float], None]]:
+def _option(name: str) -> tuple[_Read, _Write]:
     def read(model: mujoco.MjModel, index: int) -> float:
         return float(getattr(model.opt, name))
 
@@ -167,15 +196,15 @@ class Declared(Effect):
     ``length`` is that of a link: its capsules and the offsets of its children, at constant density (see
     :mod:`sb3_rpto.effects.length`); ``mass`` scales the inertia with it, and is that at the nominal length where
     the length is declared too; ``inertia`` is the first principal moment, the others in proportion, at whatever mass;
-    ``kp`` is the stiffness of a position servo, ``strength`` a factor on all that an actuator does (gain, bias and
-    force limits).
+    ``kp`` is the stiffness of a position servo, ``kv`` its damping or the gain of a velocity servo, ``strength`` a
+    factor on all that an actuator does (gain, bias and force limits).
 
     :param model: the model that has it
     :param name: ``<object>.<parameter>``, with ``joint:`` (``body:``, ``geom:``, ``actuator:``) before the object
         where two objects share a name, and ``option`` as the object of ``gravity``, ``viscosity`` and ``density``
     :param bounds: smallest and largest value; default: from 0, or a tenth to ten times the nominal value
-    :raises ValueError: no such object or parameter, a nominal value of zero where only factors make sense, bounds that
-        do not hold the nominal value
+    :raises ValueError: no such object or parameter, an actuator that is not the servo which has it, a nominal value of
+        zero where only factors make sense, bounds that do not hold the nominal value
     """
 
     kind = "declared"
@@ -186,7 +215,10 @@ class Declared(Effect):
         #: kind of object it belongs to, or ``option``
         self.owner, self.index, self._how = _find(model, name)
         how = self._how
-        nominal = how.read(model, self.index)
+        try:
+            nominal = how.read(model, self.index)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
         if how.span is not None and nominal == 0:
             raise ValueError(f"{name} is 0 in the model, so it cannot be scaled; give it a value in the MJCF")
         lower, upper = bounds or ((0.0, np.inf) if how.span is None else tuple(nominal * s for s in how.span))
@@ -291,9 +323,19 @@ def parameter_names(model: mujoco.MjModel) -> list[str]:
                 continue
             others = [k for k in OBJECTS if k != kind and owner in object_names(model, k)]
             for p in _KINDS[kind]:
+                if not _has(model, kind, i, p):
+                    continue
                 clash = any(p in _KINDS[k] for k in others)
                 names.append(f"{kind}:{owner}.{p}" if clash else f"{owner}.{p}")
     return names
+
+
+def _has(model: mujoco.MjModel, kind: str, index: int, parameter: str) -> bool:
+    try:
+        _KINDS[kind][parameter].read(model, index)
+    except ValueError:
+        return False
+    return True
 
 
 def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:

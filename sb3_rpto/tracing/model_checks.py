@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -114,16 +114,12 @@ def _check_actuators(model: mujoco.MjModel) -> None:
             )
 
 
-def soft_friction(model: mujoco.MjModel, declared: Sequence[str]) -> list[Finding]:
-    """Joints with dry friction, in the model or declared, that creeps for longer than the model's steps make it.
-
-    :param declared: names of declared parameters
-    """
+def soft_friction(model: mujoco.MjModel) -> list[Finding]:
+    """Joints that have dry friction in the model, and one that creeps; what is added to others holds."""
     found = []
     for joint, name in enumerate(object_names(model, "joint")):
         dof = model.jnt_dofadr[joint]
-        rubs = model.dof_frictionloss[dof] > 0 or f"{name}.frictionloss" in [d.split(":")[-1] for d in declared]
-        if rubs and model.dof_solref[dof, 0] > SOFT:
+        if model.dof_frictionloss[dof] > 0 and model.dof_solref[dof, 0] > SOFT:
             message = (
                 f"dry friction gives way over some {1e3 * model.dof_solref[dof, 0]:g} ms (its solreffriction); a "
                 'machine\'s holds: set solreffriction="0.001 1" solimpfriction="0.99 0.99" in the model'

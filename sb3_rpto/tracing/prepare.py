@@ -126,7 +126,7 @@ def prepare(
     nominal = discretised(compiled, fitted, fine=True)
     known = declare(nominal, declared)
     if seems == "machine":
-        findings += soft_friction(nominal, [d.label for d in known])
+        findings += soft_friction(nominal)
     settings = {Declared(nominal, name, (-np.inf, np.inf)).number: name for name in data.columns.params}
     for one in known:
         if one.number in settings:

@@ -28,6 +28,7 @@ MODEL = mujoco.MjModel.from_xml_string("""
   <actuator>
     <motor name="motor" joint="hinge" gear="3"/>
     <position name="servo" joint="shared" kp="5"/>
+    <velocity name="speed" joint="hinge" kv="3"/>
   </actuator>
 </mujoco>""")
 
@@ -43,6 +44,18 @@ def test_nominal_values_and_units() -> None:
     assert [d.values[0] for d in found] == pytest.approx([0.2, 3.0, 5.0, 0.5, 9.81, 1.2])
     assert [d.parameters[0].unit for d in found] == ["N·m·s/rad", "", "N·m/rad", "m", "m/s²", "kg/m³"]
     assert repr(found[0]) == "hinge.damping = 0.2 N·m·s/rad"
+
+
+def test_a_servos_gains_are_those_of_servos() -> None:
+    kp, kv, speed = declare(MODEL, ["servo.kp", "servo.kv", "speed.kv"])
+    assert [float(d.values[0]) for d in (kp, kv, speed)] == [5.0, 0.0, 3.0]
+    for name, said in (
+        ("speed.kp", "no position servo; declare its gain, kv"),
+        ("motor.kv", "no position or velocity"),
+    ):
+        with pytest.raises(ValueError, match=f"{name}: the actuator is {said}"):
+            declare(MODEL, [name])
+        assert name not in parameter_names(MODEL)
 
 
 def test_default_bounds() -> None:
@@ -151,6 +164,11 @@ def written(world: World, name: str, value: float) -> World:
         ("motor.gear", 4.0, "actuator_gear", (0, 0), 4.0),
         ("motor.strength", 0.5, "actuator_gainprm", (0, 0), 0.5),
         ("servo.kp", 7.0, "actuator_biasprm", (1, 1), -7.0),
+        ("servo.kv", 0.5, "actuator_gainprm", (1, 0), 5.0),
+        ("servo.kv", 0.5, "actuator_biasprm", (1, 2), -0.5),
+        ("speed.kv", 2.0, "actuator_gainprm", (2, 0), 2.0),
+        ("speed.kv", 2.0, "actuator_biasprm", (2, 2), -2.0),
+        ("speed.kv", 2.0, "actuator_biasprm", (2, 1), 0.0),
         ("rod.friction", 0.3, "geom_friction", (0, 0), 0.3),
         ("option.gravity", 4.905, "opt.gravity", 2, -4.905),
         ("option.density", 3.0, "opt.density", (), 3.0),
