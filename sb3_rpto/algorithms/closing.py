@@ -19,6 +19,7 @@ from sb3_rpto.envs.observations import single_env
 from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.report import Traced
+from sb3_rpto.tracing.trace import SETTLED
 
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.transfer import TransferAlgorithm
@@ -28,8 +29,6 @@ FIRST, AGAIN = 200, 200
 #: Another trace is due when the one-step error of new transitions is so many times that after the last, and, where the
 #: last one did not account for everything, when there are so many times as many transitions.
 RISEN, MORE = 2.0, 2
-#: Verdicts that leave nothing to look for.
-SETTLED = ("complete", "explained")
 #: Samples in a window: several steps show what acts late, and contacts do not amplify errors yet.
 WINDOW = 4
 #: What is found is kept when the one-step error falls below this share of the best without it.

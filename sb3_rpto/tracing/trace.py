@@ -19,12 +19,16 @@ from sb3_rpto.tracing.prepare import Progress, SetUp, prepare
 from sb3_rpto.tracing.report import Candidate, Report, Traced
 from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary
 from sb3_rpto.tracing.screen import Screening
-from sb3_rpto.tracing.search import find
+from sb3_rpto.tracing.search import Found, find
 from sb3_rpto.tracing.select import Selection, Selector
 from sb3_rpto.tracing.windows import Windows
 
 #: Windows count as stray, too, only where they err by so many times the typical error.
 APART = 3.0
+#: Verdicts that leave nothing to look for.
+SETTLED = ("complete", "explained")
+#: Commands one sample earlier that leave less than this share of the error were logged after they had acted.
+EARLY = 0.5
 _NEVER = "adding it lowers the error of unseen windows by nothing clear"
 #: Most iterations of the last fits: where two parameters do nearly the same, a descent goes slowly along their valley.
 FINAL = 40
@@ -101,13 +105,16 @@ def trace(
     residuals_before = force_residuals(simulation, before.values, data)
     residuals_after = force_residuals(simulation, final, data)
     unknown = np.full(simulation.model.nv, np.nan)  # where all runs are too short to differentiate
+    verdict = judge(found.before, found.after, bool(selection.model.effects))
+    if verdict not in SETTLED:
+        findings += _early(found, fitted)
     findings += _strays(selector, final, set_up, seed)
     unstable = problem.unstable(final)
     if unstable:
         message = f"in {unstable} of {len(problem.windows)} the corrected model became unstable; lower its timestep"
         findings.append(Finding("unstable", "fitted windows", message))
     return Report(
-        verdict=judge(found.before, found.after, bool(selection.model.effects)),
+        verdict=verdict,
         declared=_declared(simulation, final, intervals),
         effects=_kept(selection, simulation, final, intervals, selector.limit(selection.model), seed),
         candidates=_fates(simulation, found.screening, selection),
@@ -243,6 +250,26 @@ def _strays(selector: Selector, values: np.ndarray, set_up: SetUp, seed: int) ->
         for where, rows in groups
         if stray[rows].any()
     ]
+
+
+def _early(found: Found, data: Measurements) -> list[Finding]:
+    """Commands that were logged with the sample after they acted: no actuator acts before it is told."""
+    train, base = found.on.fine.train, found.base.fit
+    w, step = train.windows, float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
+    if w.exact or not w.drive.commands.shape[2]:
+        return []
+    rows = max(1, round(step / float(train.simulation.model.opt.timestep)))
+    commands = np.concatenate([w.drive.commands[:, rows:], w.drive.commands[:, -rows:]], axis=1)
+    earlier = Problem(train.simulation, replace(w, drive=w.drive._replace(commands=commands)), train.scales)
+    fit = earlier.fit(base.values, found.on.fine.free(()), base.starts)
+    share = float(np.median(fit.errors) / np.median(base.errors))
+    if share > EARLY:
+        return []
+    message = (
+        f"with all commands one sample ({step:.3g} s) earlier the declared model errs by {share:.0%} of what it does: "
+        "each row seems to hold the command of the row before; shift the ctrl columns up a row and trace again"
+    )
+    return [Finding("early response", "all episodes, ctrl", message)]
 
 
 def _check_arguments(

@@ -1,4 +1,4 @@
-"""Steps in time that err by more than the noise do not pass for something that the model lacks."""
+"""Steps in time that err, and commands logged late, do not pass for something that the model lacks."""
 
 import mujoco
 import numpy as np
@@ -18,9 +18,9 @@ CRANK = """
 HARD = 'frictionloss="0.25" solreffriction="0.0008 1" solimpfriction="0.999 0.9999 0.001"'
 
 
-@pytest.fixture(scope="module")
-def rubbing() -> Measurements:
-    model, rng, tables = mujoco.MjModel.from_xml_string(CRANK.format(friction=HARD)), np.random.default_rng(1), {}
+def crank(friction: str, late: int = 0) -> Measurements:
+    """The machine, finely simulated; rows hold the commands of so many rows before."""
+    model, rng, tables = mujoco.MjModel.from_xml_string(CRANK.format(friction=friction)), np.random.default_rng(1), {}
     model.opt.timestep, model.opt.integrator = 2e-4, int(mujoco.mjtIntegrator.mjINT_RK4)
     for run in range(5):
         data, t = mujoco.MjData(model), np.arange(750) / 250
@@ -31,8 +31,13 @@ def rubbing() -> Measurements:
             data.ctrl[0] = now
             mujoco.mj_step(model, data, 20)
         noisy = np.array(position) + 1e-3 * rng.standard_normal(len(t))
-        tables[f"run{run}"] = {"time": t, "qpos.crank": noisy, "ctrl.motor": torque}
+        tables[f"run{run}"] = {"time": t, "qpos.crank": noisy, "ctrl.motor": np.roll(torque, late)}
     return Measurements.from_tables(tables)
+
+
+@pytest.fixture(scope="module")
+def rubbing() -> Measurements:
+    return crank(HARD)
 
 
 def test_dry_friction_is_judged_with_steps_that_meet_its_kinks(rubbing: Measurements) -> None:
@@ -73,3 +78,11 @@ def test_finer_steps_are_not_taken_where_the_model_is_adequate(monkeypatch: pyte
     data = Measurements.from_tables(tables)
     report = trace(CRANK.format(friction=""), data, ["crank.damping"], candidates=["coulomb_friction"], threads=1)
     assert report.verdict == "complete"
+
+
+@pytest.mark.parametrize(("late", "friction", "said"), [(1, "", ["all episodes, ctrl"]), (0, HARD, [])])
+def test_commands_logged_after_they_acted_are_found(late: int, friction: str, said: list[str]) -> None:
+    model = CRANK.format(friction="")
+    report = trace(model, crank(friction, late), ["crank.damping"], candidates=["command_gain"], threads=1)
+    assert report.verdict not in ("complete", "explained")
+    assert [f.where for f in report.findings if f.kind == "early response"] == said
