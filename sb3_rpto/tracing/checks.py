@@ -1,5 +1,6 @@
 """What can be wrong with one recorded run: pure functions on arrays, each of which repairs or reports one thing."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -36,6 +37,17 @@ class Finding:
 
     def __str__(self) -> str:
         return f"{self.kind} in {self.where}: {self.message}"
+
+
+def grouped(findings: Sequence[Finding]) -> list[Finding]:
+    """Findings that say the same of several places as one, in their order."""
+    places: dict[tuple[str, str], list[str]] = {}
+    for finding in findings:
+        places.setdefault((finding.kind, finding.message), []).append(finding.where)
+    return [
+        Finding(kind, where[0] if len(where) == 1 else f"{where[0]} and {len(where) - 1} more", message)
+        for (kind, message), where in places.items()
+    ]
 
 
 def split_at_gaps(time: np.ndarray) -> list[slice]:

@@ -1,6 +1,6 @@
 """One recorded run: read from a table, checked, repaired."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,6 +11,10 @@ from sb3_rpto.tracing.columns import Columns, joint_of
 
 Table = Mapping[str, np.ndarray]
 PARTS = ("train", "select", "test")
+#: Runs whose samples are so many times as far apart as others' have times in another unit.
+OTHER_UNIT = 100.0
+#: Degrees in a radian.
+DEGREES = 180 / np.pi
 #: Times in s should be told as finely as this.
 FINEST = 1e-10
 
@@ -138,6 +142,21 @@ def read_run(file: str, name: str, rows: dict[str, np.ndarray], columns: Columns
     )
 
 
+def check_clocks(episodes: Sequence[Episode]) -> None:
+    """Refuse runs whose clocks differ by so much that they can hardly have one unit.
+
+    :raises ValueError: such a one, named
+    """
+    steps = [float(np.median(np.diff(e.time))) for e in episodes]
+    usual = sorted(steps)[(len(steps) - 1) // 2] if steps else 0.0
+    for episode, step in zip(episodes, steps):
+        if not usual / OTHER_UNIT < step < usual * OTHER_UNIT:
+            raise ValueError(
+                f"{episode.name}: the median step of column 'time' is {step:g}, that of most episodes {usual:g}; give "
+                "the times of all in seconds"
+            )
+
+
 def repair(run: Episode, columns: Columns, findings: list[Finding]) -> list[Episode]:
     """Split a run at its gaps, unwrap its angles, estimate what velocities it lacks; report each."""
     slices = checks.split_at_gaps(run.time)
@@ -218,9 +237,11 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
         slope = None if position is None else checks.velocity_slope(time, position, velocity)
         if slope is None or checks.SLOPE[0] <= slope <= checks.SLOPE[1]:
             continue
-        kind, cause = (
-            ("flipped velocity", "its sign is flipped") if slope < 0 else ("velocity slope", "check units and filters")
-        )
+        kind, cause = "velocity slope", "check units and filters"
+        if slope < 0:
+            kind, cause = "flipped velocity", "its sign is flipped"
+        elif any(checks.SLOPE[0] <= slope / factor <= checks.SLOPE[1] for factor in (DEGREES, 1 / DEGREES)):
+            cause = "one of the two is in degrees; give both in rad"
         say(
             kind,
             f"slope against the position's change is {slope:.2f}, not 1: {cause}; kept as it is",

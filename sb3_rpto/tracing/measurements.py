@@ -16,7 +16,7 @@ import numpy as np
 from sb3_rpto.tracing import checks
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.columns import Columns, joint_of, read_columns
-from sb3_rpto.tracing.episodes import PARTS, Episode, Table, read_run, repair, runs_of
+from sb3_rpto.tracing.episodes import PARTS, Episode, Table, check_clocks, read_run, repair, runs_of
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -148,6 +148,7 @@ class Measurements:
                     continue
                 seen[content] = name
                 episodes += repair(run, columns, findings)
+        check_clocks(episodes)
         if not episodes:
             raise ValueError(
                 f"{first}: no stretch between gaps has {checks.MIN_ROWS} rows; record longer or drop fewer samples"
@@ -285,7 +286,10 @@ def _read_csv(path: str) -> dict[str, np.ndarray]:
         raise ValueError(f"{path}: no text in UTF-8 ({error}); save the table as CSV in UTF-8") from error
     if not rows:
         raise ValueError(f"{path}: the file is empty; give a header and one row a sample")
-    header = rows.pop(0)
+    header = [name.strip() for name in rows.pop(0)]
+    other = next((mark for mark in ";\t" if mark in header[0]), None)
+    if other is not None:
+        raise ValueError(f"{path}: the columns are separated by {other!r}; separate them by commas, decimals by points")
     read_columns(header, path)
     for number, row in enumerate(rows):
         if len(row) != len(header):

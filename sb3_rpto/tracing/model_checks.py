@@ -24,6 +24,10 @@ SLOW = 0.02
 """A machine sampled at longer steps than this, in s, is said to be sampled slowly."""
 LONGEST_STEP, MOST_SUBSTEPS = 0.5, 500
 """Samples farther apart than this in s, and than so many steps of the model, are taken for times in another unit."""
+SHORTEST_STEP = 0.01
+"""Samples nearer to each other than this share of the model's step are taken for times in another unit."""
+TURNS = 6
+"""Hinges that move over more turns than this are said to: the angles may be in degrees."""
 SOFT = 0.005
 """Dry friction with a longer time constant than this, in s, creeps by more than the noise (MuJoCo's default: 0.02)."""
 LAG = 2
@@ -89,7 +93,8 @@ def check_names(model: mujoco.MjModel, data: Measurements) -> None:
                 raise ValueError(
                     f"the model's {what} {name!r} has no column '{prefix}.{expected[0]}'; "
                     + (
-                        "record it or take the joint out of the model"
+                        "record it, take the joint out of the model or, where an equality constraint ties it to "
+                        "others, add the column that follows from theirs"
                         if prefix == "qpos"
                         else "add it, 0 where at rest"
                     )
@@ -137,6 +142,11 @@ def _check_clock(model: mujoco.MjModel, data: Measurements) -> None:
             f"the median step of column 'time' is {step:g} s, the model's {model.opt.timestep:g} s; give times in "
             "seconds, or sample the machine faster"
         )
+    if not data.exact and 0 < step < SHORTEST_STEP * model.opt.timestep:
+        raise ValueError(
+            f"the median step of column 'time' is {step:g} s, the model's {model.opt.timestep:g} s; give times in "
+            "seconds"
+        )
 
 
 def _check_settings(model: mujoco.MjModel, data: Measurements) -> None:
@@ -172,6 +182,26 @@ def _sampling(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     if step > 1.01 * SLOW and not data.exact:
         message = f"the median step is {step:.4g} s; effects faster than that, such as a short delay, leave no trace"
         found.append(Finding("slow sampling", f"{ALL}, time", message))
+    return found
+
+
+def doubts(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
+    """What may be wrong with recordings that nothing explains: angles in degrees, commands that never change."""
+    found, hinge = [], mujoco.mjtJoint.mjJNT_HINGE
+    for i, name in enumerate(data.columns.qpos):
+        joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
+        turns = float(np.median([np.ptp(e.qpos[:, i]) for e in data.episodes])) / (2 * np.pi)
+        if joint >= 0 and model.jnt_type[joint] == hinge and turns > TURNS:
+            message = (
+                f"it spans {turns:.0f} turns in a typical run; if it is in degrees, give rad (also where the MJCF has "
+                'angle="degree")'
+            )
+            found.append(Finding("large angle", f"{ALL}, qpos.{name}", message))
+    for i, name in enumerate(data.columns.ctrl):
+        commands = np.concatenate([e.ctrl[:, i] for e in data.episodes])
+        if np.ptp(commands) == 0:
+            message = f"it is {commands[0]:g} throughout; is that what the actuator was told?"
+            found.append(Finding("constant command", f"{ALL}, ctrl.{name}", message))
     return found
 
 

@@ -15,7 +15,7 @@ from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.carry import carried_by, save_corrected
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import Adequacy
-from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.checks import Finding, grouped
 from sb3_rpto.tracing.evaluate import HorizonError
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.residuals import ForceResidual
@@ -173,7 +173,7 @@ class Report:
         if idle:
             lines += ["", "not excited by these data", *wording.aligned(idle)]
         if self.findings:
-            lines += ["", "findings", *(f"  {f}" for f in self.findings)]
+            lines += ["", "findings", *(f"  {f}" for f in grouped(self.findings))]
         return "\n".join(lines)
 
     def _values(self, found: list[Traced]) -> list[list[str]]:

@@ -15,6 +15,7 @@ from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.model_checks import doubts
 from sb3_rpto.tracing.prepare import Progress, SetUp, prepare
 from sb3_rpto.tracing.report import Candidate, Report, Traced
 from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary
@@ -102,12 +103,14 @@ def trace(
 
     say(0.9, "predicting the test runs")
     data = set_up.test if set_up.test.episodes else fitted
-    residuals_before = force_residuals(simulation, before.values, data)
-    residuals_after = force_residuals(simulation, final, data)
+    # What an equality constraint transmits is not known from the motion.
+    tied = simulation.model.neq > 0
+    residuals_before = [] if tied else force_residuals(simulation, before.values, data)
+    residuals_after = [] if tied else force_residuals(simulation, final, data)
     unknown = np.full(simulation.model.nv, np.nan)  # where all runs are too short to differentiate
     verdict = judge(found.before, found.after, bool(selection.model.effects))
     if verdict not in SETTLED:
-        findings += _early(found, fitted)
+        findings += doubts(set_up.nominal, fitted) + _early(found, fitted)
     findings += _strays(selector, final, set_up, seed)
     unstable = problem.unstable(final)
     if unstable:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sb3_rpto.experiments.planting import generate
 from sb3_rpto.tracing import Measurements
-from sb3_rpto.tracing.checks import SLOPE, quantum, smoothed_velocity, split_at_gaps, unwrap, velocity_slope
+from sb3_rpto.tracing.checks import SLOPE, grouped, quantum, smoothed_velocity, split_at_gaps, unwrap, velocity_slope
 from sb3_rpto.tracing.columns import read_columns
 
 MEASURED = Path(__file__).parents[3] / "shared" / "measured"
@@ -160,12 +160,32 @@ def test_files_need_the_same_columns():
         ("time,qpos.hinge\n0,1\n0.1,\n", r"'qpos.hinge' has 1 NaN or infinite value\(s\), first in row 1"),
         ("time,qpos.hinge\n", "0 rows are too few"),
         ("episode,time,qpos.hinge\n", "no rows"),
+        ("time;qpos.hinge\n0;1\n", "the columns are separated by ';'; separate them by commas"),
+        ("time,qpos.hinge,temperature\n0,1,2\n", "unknown column 'temperature'.* drop what the file format"),
     ],
 )
 def test_bad_csv_is_refused(text, message, tmp_path):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(ValueError, match=message):
         Measurements.from_csv(tmp_path / "a.csv")
+
+
+def test_blanks_around_a_name_are_no_part_of_it(tmp_path):
+    (tmp_path / "a.csv").write_text("time, qpos.hinge\n" + "".join(f"{i / 100},{i}\n" for i in range(9)))
+    assert Measurements.from_csv(tmp_path / "a.csv").joints == ("hinge",)
+
+
+@pytest.mark.parametrize("other", [0, 1, 2])
+def test_a_run_with_another_clock_is_refused_by_name(other):
+    tables = {f"run{i}": swing(phase=i, dt=10.0 if i == other else 0.01) for i in range(3)}
+    with pytest.raises(ValueError, match=rf"run{other}: the median step of column 'time' is 10, .* most.* 0\.01"):
+        Measurements.from_tables(tables)
+
+
+def test_what_is_found_in_many_places_is_said_once():
+    tables = {f"run{i}": {k: v for k, v in swing(phase=i).items() if k != "qvel.hinge"} for i in range(3)}
+    (once,) = grouped(Measurements.from_tables(tables).findings)
+    assert (once.kind, once.where) == ("missing velocity", "run0, qvel.hinge and 2 more")
 
 
 def test_gzipped_csv(tmp_path):
@@ -308,6 +328,7 @@ def test_velocity_against_position_is_reported(factor, kind):
     assert kinds(data) == [kind]
     said = re.search(r"slope .* is (-?[0-9.]+), not 1", data.findings[0].message)
     assert float(said[1]) == pytest.approx(factor, rel=2e-4)
+    assert ("in degrees" in data.findings[0].message) == (factor > 0)
 
 
 @pytest.mark.parametrize("system", ["cartpole", "reacher", "arm3"])

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.tracing import Measurements
-from sb3_rpto.tracing.model_checks import check_against
+from sb3_rpto.tracing.model_checks import check_against, doubts
 
 ARM = """<mujoco>
   <option timestep="0.002" integrator="implicitfast"/>
@@ -171,6 +171,24 @@ def test_times_in_milliseconds_are_refused():
     tables = {run: table | {"time": 1e3 * table["time"]} for run, table in measured(model_of()).items()}
     with pytest.raises(ValueError, match=r"median step of column 'time' is 10 s.*give times in seconds"):
         found(model_of(), tables)
+
+
+def test_times_in_kiloseconds_are_refused_too():
+    tables = {run: table | {"time": 1e-3 * table["time"]} for run, table in measured(model_of()).items()}
+    with pytest.raises(ValueError, match=r"is 1e-05 s, the model's 0.002 s; give times in seconds"):
+        found(model_of(), tables)
+
+
+def test_angles_that_may_be_degrees_and_commands_that_never_change():
+    tables = measured(model_of())
+    for table in tables.values():
+        table["qpos.elbow"], table["qvel.elbow"] = (np.degrees(table[f"{q}.elbow"]) for q in ("qpos", "qvel"))
+        table["ctrl.second"] = 0 * table["ctrl.second"]
+    said = [(f.kind, f.where) for f in doubts(model_of(), Measurements.from_tables(tables))]
+    assert said == [
+        ("large angle", "all episodes, qpos.elbow"),
+        ("constant command", "all episodes, ctrl.second"),
+    ]
 
 
 @pytest.mark.parametrize(
