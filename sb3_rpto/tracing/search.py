@@ -76,8 +76,10 @@ def find(
     on = selectors(length)
     on.say(0.05, "fitting the declared parameters")
     base = on.fine.model((), fit_declared(on.rough, seed), iterations=10)
-    on, base, before = closely(on, base, judged(on.fine, base, seed), finer, seed)
-    if before.adequate:
+    before = judged(on.fine, base, seed)
+    closer = closely(on, base, before, finer, seed)
+    if closer[2].adequate:
+        on, base, before = closer
         return Found(on, base, before, None, Selection(base), before)
     on = aligned(on, base.fit.values)
     on.say(0.15, "screening the candidates")
