@@ -167,8 +167,9 @@ class Report:
         tested = "test runs" if self.runs["test"] else "the fitted runs, as there are no test runs"
         lines += ["", f"error on {tested}: RMSE [95 % interval, of whole runs their range]"]
         lines += wording.aligned(self._errors())
-        lines += ["", "missing force by inverse dynamics, RMS; share of the rest that a small regressor predicts"]
-        lines += wording.aligned(self._forces())
+        if self.residuals_before and wording.scalar_dofs(self.simulation.model):
+            lines += ["", "missing force by inverse dynamics, RMS; share of the rest that a small regressor predicts"]
+            lines += wording.aligned(self._forces())
         idle = [[c.label, c.reason] for c in self.candidates if c.status == "not excited"]
         if idle:
             lines += ["", "not excited by these data", *wording.aligned(idle)]

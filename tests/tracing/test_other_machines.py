@@ -52,6 +52,36 @@ def findings(report) -> set[str]:
     return {f.kind for f in report.findings}
 
 
+def test_of_joints_that_a_constraint_ties_no_missing_force_is_told(tmp_path) -> None:
+    tied = machine(MOTOR).replace(
+        "</worldbody>",
+        '<body name="follower" pos="1 0 0"><joint name="tied" axis="0 -1 0"/><geom size=".05" mass=".3" pos="0 0 -.2"/>'
+        '</body></worldbody><equality><joint joint1="tied" joint2="hinge" polycoef="0 -1.5 0 0 0"/></equality>',
+    )
+    model, told, tables = mujoco.MjModel.from_xml_string(tied), torques(5, 300, 0, 1.5), {}
+    model.opt.timestep = 1 / RATE / FINE
+    for e in range(5):
+        data, rng, path = mujoco.MjData(model), np.random.default_rng(e), []
+        for k in range(300):
+            path.append(data.qpos.copy())
+            data.ctrl[:] = told[e, k]
+            mujoco.mj_step(model, data, FINE)
+        hinge = np.array(path)[:, 0] + 1e-3 * rng.standard_normal(300)
+        # Nobody measured the follower: its column follows from the other's.
+        tables[f"e{e}"] = {
+            "time": np.arange(300) / RATE,
+            "qpos.hinge": hinge,
+            "qpos.tied": -1.5 * hinge,
+            "ctrl.motor": told[e],
+        }
+    report = trace(tied, Measurements.from_tables(tables), ["hinge.damping"], candidates=["spring"], threads=1)
+    assert report.verdict == "complete"
+    assert np.isnan(report.force_before).all()
+    assert "missing force" not in str(report)
+    report.save(tmp_path)
+    assert "an equality constraint transmits" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
 def test_a_machine_without_actuators_is_complete() -> None:
     report = trace(machine(""), steps(machine("")), ["hinge.damping"], candidates=["coulomb_friction"], threads=1)
     assert report.verdict == "complete"
