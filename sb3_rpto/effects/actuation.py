@@ -7,6 +7,10 @@ import numpy as np
 
 from sb3_rpto.effects.world import World
 
+#: Actuators whose force follows the command with a time constant, ``dynprm[0]``, and all that have a state of their own
+#: which does.
+LAGS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
+FILTERS = (*LAGS, int(mujoco.mjtDyn.mjDYN_MUSCLE))
 _GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 _JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))

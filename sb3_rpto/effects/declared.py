@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.actuation import LAGS
 from sb3_rpto.effects.effect import Effect, Parameter, Scales
 from sb3_rpto.effects.length import link_length, write_length
 from sb3_rpto.effects.names import SCALAR_JOINTS, near, object_id, object_names
@@ -106,6 +107,12 @@ def _write_kv(world: World, actuator: int, values: np.ndarray, nominal: float) -
     world.field("actuator_biasprm")[:, actuator, 2] = -values
 
 
+def _read_timeconst(model: mujoco.MjModel, actuator: int) -> float:
+    if model.actuator_dyntype[actuator] not in LAGS:
+        raise ValueError("the actuator has no filter; trace actuator_lag, or give it dyntype filterexact")
+    return float(model.actuator_dynprm[actuator, 0])
+
+
 def _write_strength(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
     for name in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"):
         world.field(name)[:, actuator] *= values[:, None]
@@ -156,6 +163,7 @@ _KINDS: dict[str, dict[str, _Kind]] = {
         "gain": _Kind("", *_column("actuator_gainprm", 0), lambda s: 1.0, _POSITIVE),
         "kp": _Kind("N·m/rad", _read_kp, _write_kp, lambda s: 1.0, _POSITIVE),
         "kv": _Kind("N·m·s/rad", _read_kv, _write_kv, _viscous_size),
+        "timeconst": _Kind("s", _read_timeconst, _column("actuator_dynprm", 0)[1], lambda s: 0.01, _POSITIVE),
         "strength": _Kind("", _one, _write_strength, lambda s: 1.0, _POSITIVE),
         "damping": _Kind("N·m·s/rad", *_column("actuator_damping"), _viscous_size),
     },
@@ -197,7 +205,7 @@ class Declared(Effect):
     :mod:`sb3_rpto.effects.length`); ``mass`` scales the inertia with it, and is that at the nominal length where
     the length is declared too; ``inertia`` is the first principal moment, the others in proportion, at whatever mass;
     ``kp`` is the stiffness of a position servo, ``kv`` its damping or the gain of a velocity servo, ``strength`` a
-    factor on all that an actuator does (gain, bias and force limits).
+    factor on all that an actuator does (gain, bias and force limits), ``timeconst`` that of its filter.
 
     :param model: the model that has it
     :param name: ``<object>.<parameter>``, with ``joint:`` (``body:``, ``geom:``, ``actuator:``) before the object

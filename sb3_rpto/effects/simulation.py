@@ -10,13 +10,12 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.actuation import FILTERS
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.world import BatchWorld, World
 
-#: Actuators whose own state follows the command with a time constant, ``dynprm[0]``.
-FILTERS = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{name}")) for name in ("FILTER", "FILTEREXACT", "MUSCLE"))
 #: After so many time constants a filter has forgotten.
 CONSTANTS = 5
 
@@ -103,7 +102,10 @@ class Simulation:
         out_q[:, 0], out_v[:, 0] = qpos, qvel
         with quiet():
             if self.model.na or self.model.nhistory:
-                self._lead(world, commands[:, : drive.before], qpos, qvel)
+                # Declared filters may remember for longer than the model's own.
+                slow = [float(x.max()) for e, x in active if isinstance(e, Declared) and e.number[2] == "timeconst"]
+                seconds = max([memory(self.model), *(CONSTANTS * x for x in slow)])
+                self._lead(world, commands[:, : drive.before], qpos, qvel, seconds)
             world.qpos[:], world.qvel[:] = qpos, qvel
             self._run(world, active, commands[:, drive.before :], drive.enabled, out_q, out_v)
         bad = ~(np.isfinite(out_q).all(-1) & (np.abs(out_v) < 1e6).all(-1))
@@ -167,9 +169,9 @@ class Simulation:
             for i in np.flatnonzero(world.batch.warning[:, :, 1].any(axis=1)):
                 out_q[i, (out_q[i] == out_q[i, -1]).all(axis=-1)] = np.nan
 
-    def _lead(self, world: BatchWorld, past: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Lead the actuators' own filters and delays through the commands before the start, the motion held there."""
-        past = past[:, max(0, past.shape[1] - math.ceil(memory(self.model) / self.model.opt.timestep)) :]
+    def _lead(self, world: BatchWorld, past: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, seconds: float) -> None:
+        """Lead the actuators' own filters and delays through the last commands before the start, the motion held."""
+        past = past[:, max(0, past.shape[1] - math.ceil(seconds / self.model.opt.timestep)) :]
         if not past.shape[1]:
             return
         world.batch.bind("act")[:] = settled(self.model, past[:, 0])

@@ -196,9 +196,7 @@ def _errors(report: Report) -> str:
 def _forces(report: Report) -> str:
     model = report.simulation.model
     if not report.residuals_after:
-        return _note(
-            "Not known: the runs are short, or an equality constraint transmits what no motion tells."
-        )
+        return _note("Not known: the runs are short, or an equality constraint transmits what no motion tells.")
     rows = []
     for d in wording.scalar_dofs(model):
         sizes = [wording.number(f[d], 3) for f in (report.force_before, report.force_after)]

@@ -12,8 +12,8 @@ from scipy.ndimage import binary_erosion
 from scipy.signal import savgol_filter
 
 from sb3_rpto.effects import Declared
+from sb3_rpto.effects.actuation import FILTERS
 from sb3_rpto.effects.names import object_names
-from sb3_rpto.effects.simulation import FILTERS
 from sb3_rpto.tracing.checks import WINDOW, Finding, smoothed_velocity
 from sb3_rpto.tracing.columns import columns_of, joint_of
 from sb3_rpto.tracing.measurements import Measurements

@@ -29,6 +29,7 @@ MODEL = mujoco.MjModel.from_xml_string("""
     <motor name="motor" joint="hinge" gear="3"/>
     <position name="servo" joint="shared" kp="5"/>
     <velocity name="speed" joint="hinge" kv="3"/>
+    <general name="slow" joint="hinge" dyntype="filter" dynprm="0.03"/>
   </actuator>
 </mujoco>""")
 
@@ -52,8 +53,9 @@ def test_a_servos_gains_are_those_of_servos() -> None:
     for name, said in (
         ("speed.kp", "no position servo; declare its gain, kv"),
         ("motor.kv", "no position or velocity"),
+        ("motor.timeconst", "has no filter"),
     ):
-        with pytest.raises(ValueError, match=f"{name}: the actuator is {said}"):
+        with pytest.raises(ValueError, match=f"{name}: the actuator (is )?{said}"):
             declare(MODEL, [name])
         assert name not in parameter_names(MODEL)
 
@@ -169,6 +171,7 @@ def written(world: World, name: str, value: float) -> World:
         ("speed.kv", 2.0, "actuator_gainprm", (2, 0), 2.0),
         ("speed.kv", 2.0, "actuator_biasprm", (2, 2), -2.0),
         ("speed.kv", 2.0, "actuator_biasprm", (2, 1), 0.0),
+        ("slow.timeconst", 0.08, "actuator_dynprm", (3, 0), 0.08),
         ("rod.friction", 0.3, "geom_friction", (0, 0), 0.3),
         ("option.gravity", 4.905, "opt.gravity", 2, -4.905),
         ("option.density", 3.0, "opt.density", (), 3.0),

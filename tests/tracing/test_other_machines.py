@@ -82,6 +82,14 @@ def test_of_joints_that_a_constraint_ties_no_missing_force_is_told(tmp_path) -> 
     assert "an equality constraint transmits" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+def test_a_filters_time_constant_is_declared_and_found() -> None:
+    slow = '<general name="motor" joint="hinge" dyntype="filter" dynprm="{}"/>'
+    data = steps(machine(slow.format(0.09)))
+    report = trace(machine(slow.format(0.03)), data, ["motor.timeconst"], candidates=["command_gain"], threads=1)
+    assert report.verdict == "complete"
+    assert report.declared[0].effect.values[0] == pytest.approx(0.09, rel=0.03)
+
+
 def test_a_machine_without_actuators_is_complete() -> None:
     report = trace(machine(""), steps(machine("")), ["hinge.damping"], candidates=["coulomb_friction"], threads=1)
     assert report.verdict == "complete"
