@@ -190,7 +190,7 @@ DECLARED = "| object | parameter | unit | bounds |"
 ONE_OF_EACH = """<mujoco><option density="1" viscosity="1"/><worldbody><body name="body">
 <joint name="joint" damping="1" frictionloss="1" armature="1" stiffness="1" range="-1 1"/>
 <geom name="geom" type="capsule" fromto="0 0 0 1 0 0" size=".1"/></body></worldbody>
-<actuator><position name="actuator" joint="joint" kp="1"/></actuator></mujoco>"""
+<actuator><position name="actuator" joint="joint" kp="1" timeconst="0.1"/></actuator></mujoco>"""
 
 
 def declared_rows() -> list[str]:

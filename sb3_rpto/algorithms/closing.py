@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 
 #: Target transitions before the first trace, and new ones before another.
 FIRST, AGAIN = 200, 200
-#: Another trace is due when the one-step error of new transitions is so many times that after the last, and, where the
-#: last one did not account for everything, when there are so many times as many transitions.
-RISEN, MORE = 2.0, 2
+#: Another trace is due when the one-step error of new transitions is so many times that after the last.
+RISEN = 2.0
+#: And, where the last one did not account for everything, when there are so many times as many transitions.
+MORE = 2
 #: Samples in a window: several steps show what acts late, and contacts do not amplify errors yet.
 WINDOW = 4
 #: What is found is kept when the one-step error falls below this share of the best without it.
