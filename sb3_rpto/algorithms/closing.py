@@ -187,6 +187,27 @@ class LoopCloser:
         return new
 
 
+def trace_log(model: TransferAlgorithm) -> None:
+    """Once, before anything is learned: phi from a trace of the robot's log, where one was given.
+
+    :raises ValueError: it is to be traced and is not there
+    """
+    loop, dynamics = model.loop, model.dynamics
+    if not model._traces_log or loop is None or (loop.found and model.replay_buffer.target.size() > 0):
+        return
+    assert isinstance(dynamics, PhysicalDynamics)  # else there is nothing to trace for
+    if model.measured is None:
+        raise ValueError(
+            "this model was saved before its recordings were traced, or is loaded without its buffers, and a "
+            "checkpoint does not hold them: load_replay_buffer(), or set model.measured = "
+            "Measurements.from_csv(...) again"
+        )
+    if loop.found:
+        warm.fill_recorded(model, model.measured, dynamics.effects())
+    else:
+        loop.close_on_log(model, dynamics, model.measured)
+
+
 def _say(model: TransferAlgorithm, report: Report, added: list[str], data: str, before: float, after: float) -> None:
     """Log what a trace found, and what it did to the one-step error."""
     logger = model.logger

@@ -20,7 +20,7 @@ from stable_baselines3.sac.policies import SACPolicy
 from sb3_rpto.algorithms import arguments, checkpoint, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.checkpoint import Resumable
-from sb3_rpto.algorithms.closing import LoopCloser
+from sb3_rpto.algorithms.closing import LoopCloser, trace_log
 from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_world
 from sb3_rpto.algorithms.worlds import check_seedable, check_spaces, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
@@ -29,7 +29,7 @@ from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.weights import WeightingName
 from sb3_rpto.envs.rules import env_id
-from sb3_rpto.presets import resolve_preset
+from sb3_rpto.presets import preset_section, resolve_preset
 from sb3_rpto.tracing import Measurements
 
 Self = TypeVar("Self", bound="TransferAlgorithm")
@@ -232,24 +232,13 @@ class TransferAlgorithm(Resumable):
 
     def _apply_preset(self) -> None:
         """Set what the user did not pass; of ``dynamics_kwargs``, which both may give, the entries passed win."""
-        backend = self._preset_section()
+        backend = preset_section(self.dynamics_backend if self.updates_dynamics else None, self.env)
         source_id = None if self.env is None else env_id(self.env)
         passed = self._passed - {"dynamics_kwargs"} - ({"source_steps"} if self.source_steps == "auto" else set())
         for name, value in resolve_preset(self.preset, backend, source_id, passed).items():
             if name == "dynamics_kwargs":
                 value = {**value, **self.dynamics_kwargs}
             setattr(self, name, value)
-
-    def _preset_section(self) -> str:
-        """The part of a preset that fits the source's kind."""
-        if not self.updates_dynamics:
-            return "real"
-        cheap = self.env is not None and self.env.has_attr("parameters")  # our cart-pole, whose fits cost nothing
-        return (
-            "mujoco"
-            if self.dynamics_backend == "physical" and self.env is not None and not cheap
-            else (self.dynamics_backend)
-        )
 
     def _check_arguments(self) -> None:
         arguments.check_applicable(type(self).__name__, self.updates_dynamics, self._passed)
@@ -356,7 +345,7 @@ class TransferAlgorithm(Resumable):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         self._source_world = self._source_world or self._make_source_world()
-        self._trace_log()  # first of all: the log may be refused
+        trace_log(self)  # first of all: the log may be refused
         if not self._warm:
             checkpoint.resume_source_phase(self)
         self.begin_in_source(source_timesteps, progress_bar)
@@ -443,22 +432,6 @@ class TransferAlgorithm(Resumable):
             self.store_step(callback.locals)  # SB3 drops the step after which a callback stops
         self._collected = rollout.episode_timesteps
         return rollout.continue_training
-
-    def _trace_log(self) -> None:
-        """Once, before anything is learned: phi from a trace of the robot's log, where one was given."""
-        if not self._traces_log or self.loop is None or (self.loop.found and self.replay_buffer.target.size() > 0):
-            return
-        assert isinstance(self.dynamics, PhysicalDynamics)  # else there is nothing to trace for
-        if self.measured is None:
-            raise ValueError(
-                "this model was saved before its recordings were traced, or is loaded without its buffers, and a "
-                "checkpoint does not hold them: load_replay_buffer(), or set model.measured = "
-                "Measurements.from_csv(...) again"
-            )
-        if self.loop.found:
-            warm.fill_recorded(self, self.measured, self.dynamics.effects())
-        else:
-            self.loop.close_on_log(self, self.dynamics, self.measured)
 
     def _close_the_loop(self) -> None:
         if self.loop is not None and self.close_loop:

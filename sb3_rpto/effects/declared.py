@@ -85,8 +85,9 @@ def _servo(model: mujoco.MjModel, actuator: int) -> str:
 
 
 def _read_kp(model: mujoco.MjModel, actuator: int) -> float:
-    if _servo(model, actuator) != "position":
-        raise ValueError("the actuator is no position servo; declare its gain, kv or strength")
+    kind = _servo(model, actuator)
+    if kind != "position":
+        raise ValueError(f"the actuator is no position servo; declare its {'kv' if kind else 'gain'} or strength")
     return float(model.actuator_gainprm[actuator, 0])
 
 

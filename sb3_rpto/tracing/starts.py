@@ -33,8 +33,8 @@ def smoothed_state(
     :return: positions (m,), velocities (m,), accelerations (m,), standard deviations of the first two (2, m)
     """
     rows, t = _around(episode, index)
-    *state, spread = _cubic(t, episode.qpos[rows], lead)
-    return *state, spread[:, None] * sigma
+    *state, spread, unit = _cubic(t, episode.qpos[rows], lead)
+    return *state, spread[:, None] * sigma / unit[:, None]
 
 
 def smoothed_rotation(
@@ -56,9 +56,9 @@ def smoothed_rotation(
     turns = np.zeros((len(t), 3))
     for turn, quaternion in zip(turns, around):
         mujoco.mju_subQuat(turn, quaternion, here)
-    turn, velocity, acceleration, spread = _cubic(t, turns, lead)
+    turn, velocity, acceleration, spread, unit = _cubic(t, turns, lead)
     noise = 2 * np.sqrt((sigma**2).sum() / 3)
-    return turned(here[None], turn[None])[0], velocity, acceleration, spread * noise
+    return turned(here[None], turn[None])[0], velocity, acceleration, spread * noise / unit
 
 
 def _around(episode: Episode, index: int) -> tuple[slice, np.ndarray]:
@@ -69,10 +69,10 @@ def _around(episode: Episode, index: int) -> tuple[slice, np.ndarray]:
     return rows, episode.time[rows] - episode.time[index]
 
 
-def _cubic(t: np.ndarray, values: np.ndarray, lead: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _cubic(t: np.ndarray, values: np.ndarray, lead: float) -> tuple[np.ndarray, ...]:
     """Values at time 0, first derivatives ``lead`` before and second ones, (m,), of the cubics nearest to (n, m).
 
-    With the spread of the first two under white noise of unit variance, (2,).
+    With the spread of the first two under white noise of unit variance, (2,), and what it is to be divided by, (2,).
     """
     scale = np.abs(t).max()
     inverse = np.linalg.pinv(np.vander(t / scale, 4, increasing=True))
@@ -80,7 +80,7 @@ def _cubic(t: np.ndarray, values: np.ndarray, lead: float) -> tuple[np.ndarray, 
     z = -lead / scale
     velocity = (c[1] + 2 * z * c[2] + 3 * z**2 * c[3]) / scale
     acceleration = (2 * c[2] + 6 * z * c[3]) / scale**2
-    return c[0], velocity, acceleration, np.sqrt(np.sum(inverse[:2] ** 2, axis=1)) / np.array([1.0, scale])
+    return c[0], velocity, acceleration, np.sqrt(np.sum(inverse[:2] ** 2, axis=1)), np.array([1.0, scale])
 
 
 def start_state(

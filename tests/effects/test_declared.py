@@ -51,7 +51,7 @@ def test_a_servos_gains_are_those_of_servos() -> None:
     kp, kv, speed = declare(MODEL, ["servo.kp", "servo.kv", "speed.kv"])
     assert [float(d.values[0]) for d in (kp, kv, speed)] == [5.0, 0.0, 3.0]
     for name, said in (
-        ("speed.kp", "no position servo; declare its gain, kv"),
+        ("speed.kp", "no position servo; declare its kv or strength"),
         ("motor.kv", "no position or velocity"),
         ("motor.timeconst", "has no filter"),
     ):
