@@ -131,7 +131,7 @@ def check_something_to_fit(config: dict[str, Any], close_loop: bool | Sequence[s
         if kind not in LIBRARY:
             raise ValueError(f"close_loop: no effect {kind!r} is registered; {near(kind, LIBRARY)}")
     mujoco = config["backend"] == "physical" and is_mujoco(config)
-    if close_loop and not mujoco:
+    if close_loop is not False and not mujoco:
         raise ValueError(
             "close_loop=True traces what a MuJoCo simulator lacks: pass dynamics='physical' and a gymnasium MuJoCo env"
         )

@@ -51,10 +51,10 @@ class LoopCloser:
     """Decides when to trace, traces, and takes what is found into phi; it never spends a target step.
 
     :param declared: names of the numbers that the user declared
-    :param kinds: of effects to look for; None: all; none of them: the declared numbers alone are fitted
+    :param kinds: of effects to look for; True: all; none of them: the declared numbers alone are fitted
     """
 
-    def __init__(self, declared: tuple[str, ...], kinds: Sequence[str] | None = None) -> None:
+    def __init__(self, declared: tuple[str, ...], kinds: bool | Sequence[str] = True) -> None:
         self.declared, self.kinds = declared, kinds
         #: of this process; a checkpoint keeps what they said, :attr:`found`
         self.reports: list[Report] = []
@@ -137,7 +137,7 @@ class LoopCloser:
             measured,
             self.declared,
             seed=model.seed or 0,
-            candidates=self.kinds,
+            candidates=None if isinstance(self.kinds, bool) else self.kinds,
             horizon=horizon,
             threads=dynamics.threads,
         )

@@ -59,7 +59,8 @@ class TransferAlgorithm(Resumable):
     :param dynamics_kwargs: further arguments of the backend
     :param declared: names of the physical parameters to fit (physical backend)
     :param close_loop: trace on D_target what the simulator lacks beside the declared numbers, add it to phi and go on
-        (``dynamics="physical"`` on MuJoCo); a list looks for effects of these kinds alone. The reports are in
+        (``dynamics="physical"`` on MuJoCo); a list looks for effects of these kinds alone, an empty one for
+        none, so that the declared numbers are traced and the policy learns on. The reports are in
         ``model.loop.reports`` (with Measurements also where only the declared numbers are fitted)
     :param weighting: RTO's weight: "paper", "centred", "value_aware", or None (plain supervised learning)
     :param weight_floor: epsilon of the paper: the smallest weight, above 0 or equal to it
@@ -175,7 +176,7 @@ class TransferAlgorithm(Resumable):
         self.declared = arguments.list_of_names(declared)
         self.close_loop = close_loop
         #: traces what the simulator lacks, and holds the reports; None with the loop open and no log to trace on
-        self.loop = None if not close_loop else LoopCloser(self.declared, None if close_loop is True else close_loop)
+        self.loop = None if close_loop is False else LoopCloser(self.declared, close_loop)
         self.weighting = weighting
         self.weight_floor = weight_floor
         self.real_ratio = real_ratio
@@ -434,7 +435,7 @@ class TransferAlgorithm(Resumable):
         return rollout.continue_training
 
     def _close_the_loop(self) -> None:
-        if self.loop is not None and self.close_loop:
+        if self.loop is not None and self.close_loop is not False:
             assert isinstance(self.dynamics, PhysicalDynamics)  # checked by the constructor
             if self.loop.due(self, self.dynamics):
                 self.loop.close(self, self.dynamics)

@@ -75,6 +75,8 @@ METHODS: dict[str, tuple[str, tuple[int, ...], dict[str, Any]]] = {
     "SAC-warm": ("sac-warm", LONG, {"gradient_steps": 1}),
     "RPTO-ensemble": ("rpto", SHORT, {"dynamics": "ensemble"}),
     "RPTO-physical, open loop": ("rpto", SHORT, PHYSICAL),
+    # The closed loop without its library: what learning on in a fitted, incomplete simulator is worth.
+    "RPTO-physical, declared alone": ("rpto", SHORT, {**PHYSICAL, "close_loop": []}),
     "RPTO-physical, closed loop": ("rpto", SHORT, {**PHYSICAL, "close_loop": True}),
 }
 

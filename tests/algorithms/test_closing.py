@@ -102,6 +102,20 @@ def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPat
         made.loop.close(made, dynamics(made))
 
 
+def test_an_empty_list_traces_the_declared_numbers_alone(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    began = []
+    monkeypatch.setattr(closing, "learn_in_source", lambda made: began.append(made.num_timesteps))
+    made = model(friction(), close_loop=[])
+    with pytest.warns(UserWarning, match="unexplained"):
+        made.learn(90, source_timesteps=100)
+    assert made.loop is not None
+    report: Report = made.loop.reports[0]
+    assert [traced.label for traced in report.declared] == ["pole.length"]
+    assert not report.effects
+    assert dynamics(made).names == ["pole.length"]
+    assert began == [80]
+
+
 def test_no_target_step_is_spent_on_tracing() -> None:
     made = learned()
     assert made.num_timesteps == 100
