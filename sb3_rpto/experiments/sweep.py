@@ -128,9 +128,11 @@ def run(
     places = [place for place in suite.places if place.task in dict(wanted)]
     with _started(backend, workers):
         side_by_side = partial(spread, workers=workers, backend=backend)
-        agents = dict(side_by_side(partial(_agent, folder=folder / "sources"), places))
+        train = partial(_agent, folder=folder / "sources")
+        agents = _prepared("source agent", side_by_side(train, places), len(places))
         measure = partial(_reference, agents=agents, folder=folder / "sources")
-        references = known.get("references", {}) | dict(side_by_side(measure, targets))
+        measured = _prepared("oracle", side_by_side(measure, targets), len(targets))
+        references = known.get("references", {}) | measured
         manifest = {**_about(suite, seeds), "references": references, "versions": versions(), "commit": commit()}
         write_atomically(folder / "manifest.json", json.dumps({**manifest, **machine()}, indent=1) + "\n")
         tasks = [Task(job, *agents[job.task], str(folder / "runs")) for job in listed]
@@ -139,6 +141,16 @@ def run(
         for result in side_by_side(work, pending):
             say(result)
     return [json.loads((folder / "runs" / f"{job.name}.json").read_text(encoding="utf-8")) for job in listed]
+
+
+def _prepared(what: str, answers: Iterator[tuple[str, Answer]], count: int) -> dict[str, Answer]:
+    """What is found at once or trained for minutes before the first run, with a line for each that is there."""
+    print(f"[0/{count}] {what}s: found, or trained now and kept", file=sys.stderr, flush=True)
+    ready = {}
+    for name, answer in answers:
+        ready[name] = answer
+        print(f"[{len(ready)}/{count}] {what} of {name} is there", file=sys.stderr, flush=True)
+    return ready
 
 
 def _about(suite: Suite, seeds: int | None) -> dict[str, Any]:

@@ -132,6 +132,16 @@ def test_a_failed_run_is_kept_said_and_does_not_stop_the_others(
     assert result["rows"] == []
 
 
+def test_agents_and_oracles_are_said_before_the_first_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sweep.run(SUITE, tmp_path, workers=1, only="zero-shot_0")
+    assert capsys.readouterr().err.splitlines()[:4] == [
+        "[0/1] source agents: found, or trained now and kept",
+        "[1/1] source agent of ContinuousCartPole is there",
+        "[0/1] oracles: found, or trained now and kept",
+        "[1/1] oracle of ContinuousCartPole_limb-x2 is there",
+    ]
+
+
 def test_time_left_goes_by_what_runs_were_expected_to_cost(capsys: pytest.CaptureFixture[str]) -> None:
     cheap, dear = jobs(SUITE)[:2]
     say = sweep._Progress([replace(cheap, seconds=10.0), replace(dear, seconds=600.0)], workers=2)
