@@ -1,10 +1,12 @@
 """What 200 transitions of a target say about what its simulator lacks: traces of targets whose truth is known.
 
     python examples/trace_targets.py --tasks cheetah --targets 0 1 2 3 4 5
+    python examples/trace_targets.py --tasks hopper --targets 0 --noise 0.001
 
 The targets are those of examples/closed_loop_study.py, by number, so that ones can be taken that nothing was tuned on.
-The source's policy acts in each for 200 steps, as at the beginning of a transfer; no policy learns. Finished traces are
-kept in --runs, the table goes to --out.
+The source's policy acts in each for 200 steps, as at the beginning of a transfer; no policy learns. With --noise it is
+ten runs of at most 100 steps, of which a log shows positions alone, with that noise, at about 100 Hz. Finished traces
+are kept in --runs, the table goes to --out.
 """
 
 from __future__ import annotations
@@ -30,16 +32,18 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=list(study.TASKS), choices=list(study.TASKS))
     parser.add_argument("--shifts", nargs="+", default=list(study.SHIFTS), choices=study.SHIFTS)
     parser.add_argument("--targets", nargs="+", type=int, default=list(range(6)))
+    parser.add_argument("--noise", type=float, default=0.0, help="of a log's positions in rad or m (default: exact)")
     parser.add_argument("--workers", type=int, default=2, help="traces side by side")
     parser.add_argument("--runs", type=Path, default=Path("runs/trace_targets"), help="where single traces are kept")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "trace_targets")
+    parser.add_argument("--out", type=Path, help="where the table goes")
     a = parser.parse_args()
+    a.out = a.out or Path(__file__).parent / "results" / ("trace_logs" if a.noise else "trace_targets")
     for folder in (a.runs, a.out):
         folder.mkdir(parents=True, exist_ok=True)
     for task in a.tasks:
         study.source_agent(task, a.runs)
     # Target by target, so that an unfinished table is a fair sample.
-    jobs = [Job(task, shift, target) for target in a.targets for task in a.tasks for shift in a.shifts]
+    jobs = [Job(task, shift, target, noise=a.noise) for target in a.targets for task in a.tasks for shift in a.shifts]
     with ProcessPoolExecutor(a.workers) as pool:
         rows = list(tqdm(pool.map(partial(run, folder=a.runs), jobs), total=len(jobs), desc="traces"))
     table = pd.DataFrame(rows).sort_values(["task", "shift", "target"])
@@ -47,7 +51,7 @@ def main() -> None:
     packages = ("sb3-rpto", "torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
     manifest = {
         "command": "python examples/trace_targets.py",
-        "settings": {"tasks": a.tasks, "shifts": a.shifts, "targets": a.targets},
+        "settings": {"tasks": a.tasks, "shifts": a.shifts, "targets": a.targets, "noise": a.noise},
         "versions": {name: version(name) for name in packages},
         "python": platform.python_version(),
     }

@@ -1,4 +1,4 @@
-"""What the first trace of a transfer finds in its few target transitions, on targets whose truth is known."""
+"""What a trace finds in a transfer's first target transitions, or in a noisy log, on targets whose truth is known."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ from sb3_rpto.algorithms.closing import FIRST, WINDOW
 from sb3_rpto.effects import Declared
 from sb3_rpto.experiments.closed_loop import TASKS, make_source, make_target, shifted, source_agent
 from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.tracing.columns import columns_of
 from sb3_rpto.tracing.report import write_atomically
+
+#: A noisy log: runs, steps of the policy in each, and the longest time between two samples in s.
+RUNS, STEPS, SAMPLED = 10, 100, 0.01
 
 
 @dataclass(frozen=True)
@@ -27,12 +31,14 @@ class Job:
     :param shift: of :data:`sb3_rpto.experiments.closed_loop.SHIFTS`
     :param target: number that the target is drawn from
     :param seed: of the target's starts and the policy's noise
+    :param noise: standard deviation of a log's positions in rad or m, velocities not measured; 0: exact transitions
     """
 
     task: str
     shift: str
     target: int
     seed: int = 0
+    noise: float = 0.0
 
 
 def run(job: Job, folder: Path) -> dict[str, Any]:
@@ -43,18 +49,14 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
     :return: verdict, R before and after, what was named, what was there, largest relative error of the declared
         numbers, seconds
     """
-    path = folder / f"trace_{job.task}_{job.shift}_{job.target}_{job.seed}.json"
+    how = f"_{job.noise:g}" if job.noise else ""
+    path = folder / f"trace_{job.task}_{job.shift}_{job.target}_{job.seed}{how}.json"
     if not path.exists():
-        data = first_transitions(job, folder)
+        source = make_source(job.task)
+        data = noisy_log(job, folder) if job.noise else first_transitions(job, folder)
+        horizon = None if job.noise else (WINDOW - 1) * float(source.unwrapped.dt)  # type: ignore[attr-defined]
         began = time.perf_counter()
-        report = trace(
-            make_source(job.task),
-            data,
-            TASKS[job.task].declared,
-            seed=job.seed,
-            horizon=(WINDOW - 1) * float(make_source(job.task).unwrapped.dt),  # type: ignore[attr-defined]
-            threads=1,
-        )
+        report = trace(source, data, TASKS[job.task].declared, seed=job.seed, horizon=horizon, threads=1)
         row = {**asdict(job), **judged(job, report), "seconds": round(time.perf_counter() - began, 1)}
         write_atomically(path, json.dumps(row, indent=1) + "\n")
     return dict(json.loads(path.read_text()))
@@ -69,6 +71,37 @@ def first_transitions(job: Job, folder: Path) -> Measurements:
     sac.learn(FIRST)  # collects, without an update
     assert sac.replay_buffer is not None
     return Measurements.from_replay(sac.replay_buffer, target)
+
+
+def noisy_log(job: Job, folder: Path) -> Measurements:
+    """Runs of the source's stochastic policy in the target, as a robot's log shows them: positions, with noise."""
+    agent = SAC.load(source_agent(job.task, folder)[0], device="cpu")
+    env = make_target(job.task, job.shift, job.target)
+    robot: Any = env.unwrapped
+    columns, rng = columns_of(robot.model), np.random.default_rng(job.seed)
+    skip, step = robot.frame_skip, robot.model.opt.timestep
+    stride = max(n for n in range(1, skip + 1) if skip % n == 0 and (n == 1 or n * step <= SAMPLED))
+    tables = {}
+    agent.set_random_seed(job.seed)
+    for run in range(RUNS):
+        observation, _ = env.reset(seed=RUNS * job.seed + run)
+        positions, commands = list[np.ndarray](), list[np.ndarray]()
+        ended = False
+        while len(positions) < STEPS * skip // stride and not ended:
+            command, _ = agent.predict(observation, deterministic=False)
+            robot.frame_skip = stride
+            for _ in range(skip // stride):
+                positions.append(robot.data.qpos.copy())
+                commands.append(command)
+                observation, _, ended, _, _ = env.step(command)
+            robot.frame_skip = skip
+        shown = np.array(positions) + job.noise * rng.standard_normal((len(positions), robot.model.nq))
+        table = {"time": stride * step * np.arange(len(shown))}
+        table |= {f"qpos.{name}": shown[:, i] for i, name in enumerate(columns.qpos)}
+        table |= {f"ctrl.{name}": np.array(commands)[:, i] for i, name in enumerate(columns.ctrl)}
+        tables[f"run{run}"] = table
+    env.close()
+    return Measurements.from_tables(tables)
 
 
 def judged(job: Job, report: Report) -> dict[str, Any]:

@@ -23,9 +23,10 @@ NOTHING = 1e-12
 
 
 def led_on(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
-    """Concentrate a fit; where exact data still err, begin anew beside the best (basin hopping, Wales and Doye 1997).
+    """Concentrate a fit; where it may still err, begin anew beside the best (basin hopping, Wales and Doye 1997).
 
-    Measured data's starts are fitted too and round the kinks off, so there it ends with the concentration.
+    That is done for exact data, until they are met, and where contacts come and go. The starts of other measured data
+    are fitted too and round the kinks off, so there it ends with the concentration.
 
     :param problem: windows
     :param fit: to them
@@ -33,7 +34,8 @@ def led_on(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     :return: never of a higher cost than ``fit``
     """
     fit, failed, rng = concentrated(problem, fit, free), 0, np.random.default_rng(0)
-    while len(free) and problem.exact and fit.errors.max() > ENOUGH and failed < HOPS:
+    hops = HOPS if len(free) and (problem.exact or problem.touching) else 0
+    while failed < hops and fit.errors.max() > ENOUGH:
         hop = 10 ** rng.uniform(*FAR_AND_NEAR) * rng.standard_normal(len(free))
         beside = fit.values.copy()
         beside[free] = np.clip(beside[free] + hop * problem.size[free], problem.lower[free], problem.upper[free])

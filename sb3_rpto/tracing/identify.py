@@ -107,7 +107,7 @@ class Problem:
         self.null = simulation.null
         self.declared = np.array([e.kind == "declared" for e in simulation.effects for _ in e.parameters], dtype=bool)
         self.moving = np.flatnonzero((windows.spread > 0).any(axis=0))  # coordinates of the start that are free
-        self.exact = windows.exact
+        self.exact, self.touching = windows.exact, windows.touching
 
     def on(self, index: np.ndarray) -> Problem:
         """The same problem on the windows at ``index``."""

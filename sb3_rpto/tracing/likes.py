@@ -125,7 +125,10 @@ class Likes:
         return model
 
     def _kind_everywhere(self, model: Model) -> Model:
-        """Try each kind in the place of all others that it resembles, at once: one alone may look no better."""
+        """Try each kind in the place of all others that it resembles, at once: one alone may look no better.
+
+        They may be fewer then: sensors of many joints that look late answer to a few commands that are.
+        """
         for kind in sorted({*self.kinds} - {"declared"}):
             like = LIKE if kind in {self.kinds[e] for e in model.effects} else AKIN
             same = self._excited(kind)
@@ -134,7 +137,7 @@ class Likes:
             nearest = {e: max(same, key=lambda i: self.screening.cosine[e, i]) for e in model.effects}
             swaps = {e: i for e, i in nearest.items() if self.kinds[e] != kind and self.screening.cosine[e, i] > like}
             trial_effects = sorted({swaps.get(e, e) for e in model.effects})
-            if len(swaps) < 2 or len(trial_effects) < len(model.effects):
+            if len(swaps) < 2:
                 continue
             self.selector.say(1.0, f"{kind} in all places")
             begin = model.fit

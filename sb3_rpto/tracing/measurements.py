@@ -36,6 +36,7 @@ class Measurements:
     :param unobserved: names of ``columns.qpos`` that were not measured: not to be compared with a prediction
     :param exact: whether the samples come from a simulator: no measurement noise, exact velocities
     :param simulated: whether they come from the model's own steps in time, with noise
+    :param touching: whether contacts come and go in these measured data
     """
 
     episodes: list[Episode]
@@ -44,6 +45,7 @@ class Measurements:
     unobserved: tuple[str, ...] = ()
     exact: bool = False
     simulated: bool = False
+    touching: bool = False
 
     @property
     def joints(self) -> tuple[str, ...]:

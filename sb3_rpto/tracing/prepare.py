@@ -13,6 +13,7 @@ from sb3_rpto.effects import LIBRARY, Declared, Effect, Scales, Simulation, decl
 from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.contacts import contact_changes
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.model_checks import check_against, soft_friction
 from sb3_rpto.tracing.origin import origin
@@ -30,6 +31,11 @@ OVERLAP = 2 / 3
 SHORT = 15.0
 #: Fewer windows than this overlap.
 FEW = 40
+#: Where contacts come and go this often a second, windows are so many seconds long: an error about the moment of a
+#: touch-down grows to far more than noise.
+OFTEN, BRIEF = 0.5, 0.1
+#: And so many times as many.
+MANY = 4
 #: Where steps in time seem to err by more than the noise, others so many times as short are tried.
 SHORTER = 4
 #: Where what is found leaves errors far above the noise, windows so many times as long show more of what is missing,
@@ -113,7 +119,12 @@ def prepare(
     findings += [f for f in train.findings if f not in findings]
     fitted = replace(data, episodes=train.episodes + select.episodes)
     sigma = noise_levels(fitted)
-    length = _horizon(fitted) if horizon is None else horizon
+    changes = contact_changes(compiled, fitted)
+    touching = changes > OFTEN
+    length = _horizon(fitted, touching) if horizon is None else horizon
+    if touching and horizon is None:
+        message = f"{changes:.1f} a second come or go; windows of {length:.2g} s, as errors about a touch-down grow"
+        findings.append(Finding("contacts", "fitted runs", message))
     seems = origin(compiled, fitted, declared, sigma, length, threads)
     if seems != "machine":
         data, train, select, test, fitted = (
@@ -123,6 +134,8 @@ def prepare(
         noise = "without noise" if data.exact else "with noise"
         message = f"from the model's own steps in time, {noise}: they meet them better than the continuous motion does"
         findings.append(Finding("simulated", "fitted runs", message))
+    touching &= not data.exact  # those are met, or fits begin anew until they are
+    train, select, test, fitted = (replace(d, touching=touching) for d in (train, select, test, fitted))
     nominal = discretised(compiled, fitted, fine=True)
     known = declare(nominal, declared)
     if seems == "machine":
@@ -148,12 +161,15 @@ def _candidates(model: mujoco.MjModel, declared: list[str], kinds: Sequence[str]
     return [e for e in all_candidates(model, declared) if kinds is None or e.kind in kinds]
 
 
-def _horizon(data: Measurements) -> float:
+def _horizon(data: Measurements, touching: bool) -> float:
     """Half a second, at least eight samples, at most a third of the longest episode.
 
-    Short data take 0.8 s: an effect shows more against the noise of so few windows.
+    Short data take 0.8 s: an effect shows more against the noise of so few windows. Where contacts come and go,
+    :data:`BRIEF`, at least three steps from sample to sample.
     """
     step = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
+    if touching:
+        return max(BRIEF, 3 * step)
     lengths = [float(e.time[-1] - e.time[0]) for e in data.episodes]
     usual = 0.5 if sum(lengths) >= SHORT else 0.8
     return min(max(usual, 8 * step), max(max(lengths) / 3, 3 * step))
@@ -183,13 +199,14 @@ def windows(
     overlap: float,
 ) -> tuple[Windows, Windows | None]:
     """Windows to fit and to select on; None to select on where too little is set apart: then blocks take turns."""
+    many = MANY if train.touching else 1
     if any(e.time[-1] - e.time[0] >= 2 * horizon for e in select.episodes):
-        judging = cut(model, select, sigma, horizon, SELECT, overlap)
+        judging = cut(model, select, sigma, horizon, many * SELECT, overlap)
         # A single block is no evidence for anything.
         if len(np.unique(judging.block)) > 1:
-            return cut(model, train, sigma, horizon, TRAIN, overlap), judging
+            return cut(model, train, sigma, horizon, many * TRAIN, overlap), judging
     train = replace(train, episodes=train.episodes + select.episodes)
-    every = cut(model, train, sigma, horizon, TRAIN + SELECT, overlap)
+    every = cut(model, train, sigma, horizon, many * (TRAIN + SELECT), overlap)
     if len(every) < FEW:
         every = cut(model, train, sigma, horizon, 2 * FEW, overlap=OVERLAP)
         if len(np.unique(every.block)) < 3:

@@ -190,7 +190,7 @@ class Selector:
 
     def led_on(self, model: Model) -> Model:
         """A model that errs more than need be, out of kinks that may hold its fit; exact data can be met exactly."""
-        if not (self.train.exact or self.far(model)):
+        if not (self.train.exact or self.train.touching or self.far(model)):
             return model
         return self._remembered(model.effects, led_on(self.train, model.fit, self.free(model.effects)))
 

@@ -47,6 +47,7 @@ class Windows:
     :param episode: index of the episode, (W,)
     :param time: of the start in the episode, in s, (W,)
     :param exact: whether the samples come from a simulator
+    :param touching: whether contacts come and go in measured data
     """
 
     qpos: np.ndarray
@@ -63,13 +64,14 @@ class Windows:
     episode: np.ndarray
     time: np.ndarray
     exact: bool
+    touching: bool
 
     def __len__(self) -> int:
         return len(self.qpos)
 
     def take(self, index: np.ndarray) -> Windows:
         """The windows at ``index``."""
-        shared = ("drive", "sigma", "columns", "exact")
+        shared = ("drive", "sigma", "columns", "exact", "touching")
         own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in shared}
         return replace(self, drive=self.drive.take(index), **own)
 
@@ -275,6 +277,7 @@ def _build(
         np.array([number for number, _, _ in starts]),
         np.array([data.episodes[number].time[begin] for number, begin, _ in starts]),
         data.exact,
+        data.touching,
     )
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from stable_baselines3 import SAC
 
 from sb3_rpto.algorithms.closing import FIRST
 from sb3_rpto.experiments import closed_loop as study
-from sb3_rpto.experiments.first_trace import Job, first_transitions, run
+from sb3_rpto.experiments.first_trace import RUNS, Job, first_transitions, noisy_log, run
 from sb3_rpto.experiments.sources import FOLDER_VARIABLE
 
 
@@ -29,6 +30,17 @@ def test_the_first_transitions_are_the_targets_and_follow_from_the_seed(folder: 
     assert first.exact
     starts = [m.episodes[0].qpos[0].tolist() for m in (first, again, other)]
     assert starts[0] == starts[1] != starts[2]
+
+
+def test_a_log_holds_noisy_positions_of_the_simulators_steps(folder: Path) -> None:
+    exact, noisy = (noisy_log(Job("double-pendulum", "undeclared", 0, noise=noise), folder) for noise in (1e-12, 1e-3))
+    assert len(noisy.episodes) == RUNS
+    assert np.allclose(np.diff(noisy.episodes[0].time), 0.01)
+    assert len(noisy.episodes[0]) % 5 == 0  # samples of a step of the policy, which all have its command
+    assert np.all(noisy.episodes[0].ctrl[:5] == noisy.episodes[0].ctrl[0])
+    assert {f.kind for f in noisy.findings} == {"missing velocity"}
+    noise = np.concatenate([a.qpos - b.qpos for a, b in zip(noisy.episodes, exact.episodes)])
+    assert noise.std() == pytest.approx(1e-3, rel=0.1)
 
 
 @pytest.mark.parametrize(("shift", "named"), [("undeclared", "coulomb_friction(slider)"), ("none", "")])

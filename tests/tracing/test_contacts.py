@@ -1,0 +1,63 @@
+"""Recordings of a machine that touches the floor now and then."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from sb3_rpto.tracing import Measurements, trace
+from sb3_rpto.tracing.contacts import contact_changes
+
+LEG = """
+<mujoco>
+  <option timestep="0.001"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1"/>
+    <body name="trunk" pos="0 0 0.6">
+      <joint name="height" type="slide" axis="0 0 1"/>
+      <geom type="box" size="0.1 0.1 0.05" mass="2" contype="0" conaffinity="0"/>
+      <body name="leg">
+        <joint name="knee" type="slide" axis="0 0 1" damping="4" stiffness="400"/>
+        <geom name="foot" type="sphere" size="0.05" pos="0 0 -0.4" mass="0.2"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="thrust" joint="knee" gear="40"/></actuator>
+</mujoco>
+"""
+RATE, FINE = 200, 20
+
+
+def hops(xml: str = LEG, runs: int = 8, samples: int = 300, noise: float = 1e-3) -> Measurements:
+    """A leg that is pushed at random and hops, by steps of 0.25 ms; noisy positions, no velocities."""
+    model, tables = mujoco.MjModel.from_xml_string(xml), {}
+    model.opt.timestep = 1 / RATE / FINE
+    for run in range(runs):
+        rng, data = np.random.default_rng(run), mujoco.MjData(model)
+        told, path = np.repeat(rng.uniform(-1, 1, samples // 15), 15), []
+        for command in told:
+            path.append(data.qpos.copy())
+            data.ctrl[:] = command
+            mujoco.mj_step(model, data, FINE)
+        shown = np.array(path) + noise * rng.standard_normal((samples, 2))
+        time = np.arange(samples) / RATE
+        tables[f"run{run}"] = {"time": time, "qpos.height": shown[:, 0], "qpos.knee": shown[:, 1], "ctrl.thrust": told}
+    return Measurements.from_tables(tables)
+
+
+@pytest.mark.parametrize(("heights", "changes"), [((0.0, 0.1), 0), ((0.0, -0.2), 9), ((-0.2, -0.2), 0)])
+def test_touch_downs_and_lift_offs_are_counted(heights: tuple[float, float], changes: int) -> None:
+    """The foot's sphere reaches the floor at a height of -0.15 m; every other sample is at the second height."""
+    height = np.tile(heights, 5)
+    table = {"time": np.arange(10) / 10, "qpos.height": height, "qpos.knee": 0 * height, "ctrl.thrust": 0 * height}
+    data = Measurements.from_tables({"run": table})
+    assert contact_changes(mujoco.MjModel.from_xml_string(LEG), data) == pytest.approx(changes / 0.9)
+
+
+def test_a_complete_model_that_hops_is_complete() -> None:
+    report = trace(LEG, hops(), ["knee.damping"], candidates=["coulomb_friction"], seed=0)
+    (finding,) = (f for f in report.findings if f.kind == "contacts")
+    assert "windows of 0.1 s" in finding.message
+    assert report.verdict == "complete"
+    assert report.declared[0].effect.values[0] == pytest.approx(4, rel=0.05)
