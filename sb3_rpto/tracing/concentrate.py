@@ -16,6 +16,8 @@ ENOUGH = 2.0
 ITERATIONS = 10
 #: Fits begin anew beside the best one until so many in a row did not pay.
 HOPS = 3
+#: Measured data's only where the typical window errs by less than so many units of the noise.
+NEAR = 3.0
 #: How far beside it, in plausible sizes: by powers of ten between these.
 FAR_AND_NEAR = (-2.0, 0.0)
 #: A parameter shows in nothing where its curvature is this share of the largest.
@@ -25,8 +27,8 @@ NOTHING = 1e-12
 def led_on(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     """Concentrate a fit; where it may still err, begin anew beside the best (basin hopping, Wales and Doye 1997).
 
-    That is done for exact data, until they are met, and where contacts come and go. The starts of other measured data
-    are fitted too and round the kinks off, so there it ends with the concentration.
+    That is done for exact data, until they are met, and where contacts come and go, if little seems to be missing. The
+    starts of other measured data are fitted too and round the kinks off, so there it ends with the concentration.
 
     :param problem: windows
     :param fit: to them
@@ -34,7 +36,8 @@ def led_on(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     :return: never of a higher cost than ``fit``
     """
     fit, failed, rng = concentrated(problem, fit, free), 0, np.random.default_rng(0)
-    hops = HOPS if len(free) and (problem.exact or problem.touching) else 0
+    near = problem.touching and np.median(fit.errors) < NEAR
+    hops = HOPS if len(free) and (problem.exact or near) else 0
     while failed < hops and fit.errors.max() > ENOUGH:
         hop = 10 ** rng.uniform(*FAR_AND_NEAR) * rng.standard_normal(len(free))
         beside = fit.values.copy()

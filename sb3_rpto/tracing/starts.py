@@ -37,6 +37,17 @@ def smoothed_state(
     return *state, spread[:, None] * sigma / unit[:, None]
 
 
+def misfit(episode: Episode, index: int, sigma: np.ndarray) -> np.ndarray:
+    """By how many times the samples around one lie farther from their cubic than noise leaves them, (m,); at least 1.
+
+    A velocity that jumps, as at a touch-down, is no cubic, and the smoothed state there errs by as much more.
+    """
+    rows, t = _around(episode, index)
+    basis = np.vander(t / np.abs(t).max(), 4)
+    off = episode.qpos[rows] - basis @ np.linalg.lstsq(basis, episode.qpos[rows])[0]
+    return np.asarray(np.maximum(1.0, np.sqrt((off**2).sum(0) / max(1, len(t) - 4)) / sigma))
+
+
 def smoothed_rotation(
     episode: Episode, index: int, columns: np.ndarray, sigma: np.ndarray, lead: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -101,6 +112,8 @@ def start_state(
         return qpos, qvel, qacc, spread
     lead = half_step(model)
     position, velocity, acceleration, deviation = smoothed_state(episode, index, sigma, lead)
+    if data.touching:
+        deviation = deviation * misfit(episode, index, sigma)
     column = {int(address): i for i, address in enumerate(addresses)}
     for adr, dof in straight(model).items():
         if adr in column:
