@@ -44,7 +44,7 @@ def misfit(episode: Episode, index: int, sigma: np.ndarray) -> np.ndarray:
     """
     rows, t = _around(episode, index)
     basis = np.vander(t / np.abs(t).max(), 4)
-    off = episode.qpos[rows] - basis @ np.linalg.lstsq(basis, episode.qpos[rows])[0]
+    off = episode.qpos[rows] - basis @ np.linalg.lstsq(basis, episode.qpos[rows], rcond=None)[0]
     return np.asarray(np.maximum(1.0, np.sqrt((off**2).sum(0) / max(1, len(t) - 4)) / sigma))
 
 
