@@ -60,7 +60,7 @@ def test_trace_prints_the_report_and_writes_the_folder(files: Path, capsys: pyte
 
 
 def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(files, "--quiet", "--format", "csv", "--horizon", "0.3") == 0
+    assert run(files, "--quiet", "--format", "csv", "--horizon", "0.15") == 0
     captured = capsys.readouterr()
     assert captured.out.strip() in wording.VERDICTS
     assert captured.err == ""

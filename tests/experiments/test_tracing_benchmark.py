@@ -538,7 +538,7 @@ def test_the_true_structure_takes_the_error_away(monkeypatch):
 
     full = runner.trace
     monkeypatch.setattr(runner, "trace", few)
-    found = runner.examine(case, episodes=8, duration=2.5)
+    found = runner.examine(case, episodes=6, duration=1.5)
     errors = {name: e["hinge"] for name, e in found["errors"].items()}
     assert errors["true"] < 0.5 * errors["before"]
     assert errors["true"] < 1.5 * errors["floor"]

@@ -62,7 +62,7 @@ def test_a_walkers_lengths_are_found_where_contacts_hold_a_plain_fit() -> None:
 
 
 def test_the_trace_of_a_walker_without_missing_effect_names_none() -> None:
-    report = trace(gym.make("HalfCheetah-v5"), walk(), NAMES, horizon=HORIZON, threads=1)
+    report = trace(gym.make("HalfCheetah-v5"), walk(steps=120), NAMES, horizon=HORIZON, threads=1)
     assert report.verdict == "complete"
     assert not report.effects
     found = np.array([traced.effect.values[0] for traced in report.declared])

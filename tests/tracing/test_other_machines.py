@@ -7,7 +7,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from simulated import PENDULUM, compiled, recorded, torques
+from simulated import PENDULUM, briefly, compiled, recorded, torques
 
 from sb3_rpto.effects import Simulation, declare
 from sb3_rpto.effects.carry import correct
@@ -74,7 +74,7 @@ def test_of_joints_that_a_constraint_ties_no_missing_force_is_told(tmp_path) -> 
             "qpos.tied": -1.5 * hinge,
             "ctrl.motor": told[e],
         }
-    report = trace(tied, Measurements.from_tables(tables), ["hinge.damping"], candidates=["spring"], threads=1)
+    report = briefly(tied, Measurements.from_tables(tables), ["hinge.damping"], candidates=["spring"])
     assert report.verdict == "complete"
     assert np.isnan(report.force_before).all()
     assert "missing force" not in str(report)
@@ -91,7 +91,7 @@ def test_a_filters_time_constant_is_declared_and_found() -> None:
 
 
 def test_a_machine_without_actuators_is_complete() -> None:
-    report = trace(machine(""), steps(machine("")), ["hinge.damping"], candidates=["coulomb_friction"], threads=1)
+    report = briefly(machine(""), steps(machine("")), ["hinge.damping"], candidates=["coulomb_friction"])
     assert report.verdict == "complete"
     assert report.declared[0].effect.values[0] == pytest.approx(0.05, rel=0.02)
 
@@ -99,7 +99,7 @@ def test_a_machine_without_actuators_is_complete() -> None:
 @pytest.mark.parametrize("dynamics", ["filter", "filterexact"])
 def test_an_actuators_own_filter_is_led_through_the_commands_before_a_window(dynamics: str) -> None:
     xml = machine(f'<general name="motor" joint="hinge" dyntype="{dynamics}" dynprm="0.1" gainprm="1"/>')
-    report = trace(xml, steps(xml), ["hinge.damping"], candidates=[], threads=1)
+    report = briefly(xml, steps(xml), ["hinge.damping"], candidates=[])
     assert report.verdict == "complete"
     load, missing = (np.abs(r).max() for r in (report.residuals_before[0].load, report.force_before))
     assert missing < 0.1 * load
@@ -108,8 +108,8 @@ def test_an_actuators_own_filter_is_led_through_the_commands_before_a_window(dyn
 def test_an_actuators_own_delay_is_led_too() -> None:
     xml = machine('<motor name="motor" joint="hinge" delay="0.04" nsample="402"/>')
     data = steps(xml)
-    told = trace(xml, data, ["hinge.damping"], candidates=[], threads=1)
-    untold = trace(machine(MOTOR), data, ["hinge.damping"], candidates=[], threads=1)
+    told = briefly(xml, data, ["hinge.damping"], candidates=[])
+    untold = briefly(machine(MOTOR), data, ["hinge.damping"], candidates=[])
     assert told.adequacy_before.ratio < 1.2
     assert untold.adequacy_before.ratio > 5
 

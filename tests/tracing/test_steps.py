@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from simulated import briefly
 
 from sb3_rpto.tracing import Measurements, trace
 from sb3_rpto.tracing.model_checks import soft_friction
@@ -52,7 +53,7 @@ def test_dry_friction_is_judged_with_steps_that_meet_its_kinks(rubbing: Measurem
 def test_a_rubbing_machine_whose_friction_is_declared_is_complete(rubbing: Measurements) -> None:
     model = CRANK.format(friction='frictionloss="0.1" solreffriction="0.001 1" solimpfriction="0.99 0.99"')
     declared = ["crank.damping", "crank.frictionloss"]
-    report = trace(model, rubbing, declared, candidates=["coulomb_friction"], threads=1)
+    report = briefly(model, rubbing, declared, candidates=["coulomb_friction"])
     assert report.verdict == "complete"
     assert not [f for f in report.findings if f.kind == "soft friction"]
 
@@ -76,13 +77,13 @@ def test_finer_steps_are_not_taken_where_the_model_is_adequate(monkeypatch: pyte
         noisy = np.array(position) + 1e-3 * rng.standard_normal(500)
         tables[f"run{run}"] = {"time": np.arange(500) / 250, "qpos.crank": noisy, "ctrl.motor": np.zeros(500)}
     data = Measurements.from_tables(tables)
-    report = trace(CRANK.format(friction=""), data, ["crank.damping"], candidates=["coulomb_friction"], threads=1)
+    report = briefly(CRANK.format(friction=""), data, ["crank.damping"], candidates=["coulomb_friction"])
     assert report.verdict == "complete"
 
 
 @pytest.mark.parametrize(("late", "friction", "said"), [(1, "", ["all episodes, ctrl"]), (0, HARD, [])])
 def test_commands_logged_after_they_acted_are_found(late: int, friction: str, said: list[str]) -> None:
     model = CRANK.format(friction="")
-    report = trace(model, crank(friction, late), ["crank.damping"], candidates=["command_gain"], threads=1)
+    report = briefly(model, crank(friction, late), ["crank.damping"], candidates=["command_gain"])
     assert report.verdict not in ("complete", "explained")
     assert [f.where for f in report.findings if f.kind == "early response"] == said

@@ -175,7 +175,7 @@ def test_an_effect_that_is_not_among_the_candidates_is_not_explained() -> None:
 
 def test_where_much_is_left_to_explain_longer_windows_are_looked_at() -> None:
     there = [CoulombFriction("hinge", level=0.25), TorqueOffset("hinge", offset=0.1)]
-    data, friction = recorded(there, compiled(COARSE), 12, 3.2, rate=100), ["coulomb_friction"]
+    data, friction = recorded(there, compiled(COARSE), 9, 3.2, rate=50), ["coulomb_friction"]
     for horizon, used in ((None, 1.0), (0.5, 0.5)):
         report = traced_simply(data, friction, horizon=horizon)
         assert [t.label for t in report.effects] == ["coulomb_friction(hinge)"]
