@@ -10,6 +10,7 @@ from stable_baselines3 import SAC
 
 from sb3_rpto.algorithms.closing import FIRST
 from sb3_rpto.experiments import closed_loop as study
+from sb3_rpto.experiments import first_trace
 from sb3_rpto.experiments.first_trace import RUNS, Job, first_transitions, noisy_log, run
 from sb3_rpto.experiments.sources import FOLDER_VARIABLE
 
@@ -44,7 +45,10 @@ def test_a_log_holds_noisy_positions_of_the_simulators_steps(folder: Path) -> No
 
 
 @pytest.mark.parametrize(("shift", "named"), [("undeclared", "coulomb_friction(slider)"), ("none", "")])
-def test_a_trace_is_compared_with_the_truth_and_made_once(shift: str, named: str, folder: Path) -> None:
+def test_a_trace_is_compared_with_the_truth_and_made_once(
+    shift: str, named: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(first_trace, "FIRST", 120)
     job = Job("double-pendulum", shift, 7)
     row = run(job, folder)
     assert row["named_effects"] == named

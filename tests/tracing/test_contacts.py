@@ -67,7 +67,7 @@ def test_a_smoothed_start_is_less_certain_where_a_velocity_jumps(jump: float, lo
 
 
 def test_a_complete_model_that_hops_is_complete() -> None:
-    report = trace(LEG, hops(), ["knee.damping"], candidates=["coulomb_friction"], seed=0)
+    report = trace(LEG, hops(runs=6), ["knee.damping"], candidates=["coulomb_friction"], seed=0)
     (finding,) = (f for f in report.findings if f.kind == "contacts")
     assert "windows of 0.1 s" in finding.message
     assert report.verdict == "complete"

@@ -134,10 +134,10 @@ def test_actuators_whose_state_no_column_tells_are_refused(actuator: str, messag
 def test_a_stiff_finger_is_integrated_implicitly_and_it_says_so() -> None:
     xml = machine('<position name="motor" joint="hinge" kp="1"/>', 'damping="0.1"', 'size=".005" mass="0.02"', 0.05)
     data = steps(xml, size=0.5)
-    report = trace(xml, data, ["hinge.damping"], candidates=[], threads=1)
+    report = briefly(xml, data, ["hinge.damping"], candidates=[])
     assert "stiff model" in findings(report)
     assert report.adequacy_before.ratio < 1.5
-    assert "stiff model" not in findings(trace(machine(MOTOR), steps(machine(MOTOR), 4), candidates=[], threads=1))
+    assert "stiff model" not in findings(briefly(machine(MOTOR), steps(machine(MOTOR), 4), [], candidates=[]))
 
 
 def test_the_fastest_rate_of_a_damped_joint_decides_whether_a_model_is_stiff() -> None:
@@ -198,7 +198,7 @@ def test_a_select_run_shorter_than_a_window_joins_the_training_runs() -> None:
     episodes = [replace(e, part=part) for e, part in zip(data.episodes, parts)]
     short = {n: getattr(episodes[4], n)[:80] for n in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable")}
     episodes[4] = replace(episodes[4], **short)
-    report = trace(machine(MOTOR), replace(data, episodes=episodes), ["hinge.damping"], candidates=[], threads=1)
+    report = briefly(machine(MOTOR), replace(data, episodes=episodes), ["hinge.damping"], candidates=[])
     assert report.verdict == "complete"
     assert not report.judged_apart
     assert "on fitted windows" in str(report)
@@ -209,7 +209,7 @@ def test_a_test_run_too_short_for_inverse_dynamics_is_reported_without_a_missing
     episodes = [replace(e, part="train" if i < 5 else "test") for i, e in enumerate(data.episodes)]
     short = {n: getattr(episodes[5], n)[:4] for n in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable")}
     episodes[5] = replace(episodes[5], **short)
-    report = trace(PENDULUM, replace(data, episodes=episodes), candidates=[], threads=1)
+    report = briefly(PENDULUM, replace(data, episodes=episodes), [], candidates=[])
     assert report.verdict == "complete"
     assert np.isnan(report.force_before).all()
     assert "missing force" not in str(report)

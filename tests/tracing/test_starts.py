@@ -149,7 +149,7 @@ BALL = """
 
 
 def test_a_complete_machine_with_a_ball_joint_is_complete() -> None:
-    data = recorded(BALL, 6)
+    data = recorded(BALL, 4)
     report = trace(BALL, data, ["weight.mass"], candidates=["payload"], horizon=0.4, threads=1)
     assert report.verdict == "complete"
     assert report.adequacy_before.ratio == pytest.approx(1.0, abs=0.06)
