@@ -23,6 +23,7 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "fits every 50 steps": ("rpto", {**SMALL, "model_train_freq": 50}),
     "a quarter of real data": ("rpto", {**SMALL, "real_ratio": 0.25}),
     "no RTO weight": ("rpto", {**SMALL, "weighting": None}),
+    "20 updates": ("rpto", {**SMALL, "gradient_steps": 20}),
     "samples, not means": ("rpto", {"dynamics_kwargs": {**SMALL["dynamics_kwargs"], "noise": True}}),
     "RPO, the real source": ("rpo", {}),
     "SAC-warm": ("sac-warm", {}),
