@@ -277,7 +277,7 @@ def test_list_prints_runs_and_costs_and_starts_nothing(
     arguments = ["--suite", "quick", "--only", "InvertedDouble.*rpto", "--seeds", "2", "--workers", "2", "--list"]
     assert cli.main(["benchmark", "transfer", *arguments]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2 * 4 + 1  # two seeds of ensemble, physical, closed loop and residual
+    assert len(lines) == 2 * 3 + 1
     assert "min on 2 cores" in lines[-1]
     assert list(tmp_path.iterdir()) == []
 
