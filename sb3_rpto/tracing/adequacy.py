@@ -22,8 +22,8 @@ class Adequacy:
     """Typical error of the windows over that of a true model with the estimated noise.
 
     :param ratio: of the medians
-    :param low: 2.5 % quantile over resampled blocks
-    :param high: 97.5 % quantile
+    :param low: 2.5 % quantile over resampled blocks, or of what noise alone does to so many windows if that is lower
+    :param high: 97.5 % quantile, likewise
     :param strays: share of windows whose error noise does not explain
     :param chance: of as many of them by noise alone
     """
@@ -59,11 +59,16 @@ def adequacy(problem: Problem, fit: Fit, seed: int) -> Adequacy:
     for _ in range(RESAMPLES):
         rows = np.concatenate([members[i] for i in rng.integers(len(names), size=len(names))])
         medians.append(np.median(fit.errors[rows]))
+    ratio = float(np.median(fit.errors)) / typical
     low, high = np.quantile(medians, [0.025, 0.975]) / typical
+    # Two or three blocks, resampled, say next to nothing; noise in so few windows is known without them.
+    noisy = np.median(rng.choice(noise.ravel(), (RESAMPLES, len(fit.errors))), axis=1) / typical
+    least, most = np.quantile(noisy, [0.025, 0.975])
+    low, high = min(low, ratio / most), max(high, ratio / least)
     stray = fit.errors > BEYOND * np.quantile(noise, 0.99)
     count = int(stray.sum()) if len(np.unique(blocks[stray])) > 1 else 0
     return Adequacy(
-        float(np.median(fit.errors)) / typical,
+        ratio,
         float(low),
         float(high),
         float(stray.mean()),

@@ -108,12 +108,32 @@ def test_a_stalled_window_and_a_stalled_block_are_no_inadequacy() -> None:
 
 def test_the_interval_is_that_of_resampled_blocks() -> None:
     p = complete(1)
-    errors = 1 + 0.5 * (p.windows.block % 2)  # all windows of a block alike
+    levels = np.array([1.0, 1.5, 2.0])
+    errors = levels[p.windows.block % 3]  # all windows of a block alike
     one = adequacy(p, with_errors(p, errors), 0)
-    apart = Problem(p.simulation, replace(p.windows, block=np.arange(len(p.windows))), p.scales)
-    assert one.low == pytest.approx(one.ratio / np.median(errors), rel=1e-9)
-    assert one.high / one.low == pytest.approx(1.5, rel=1e-9)
-    assert adequacy(apart, with_errors(p, np.full(len(errors), 2.0)), 0).low == pytest.approx(2.0, rel=0.06)
+    assert one.ratio / one.low == pytest.approx(1.5, rel=1e-9)
+    assert one.high / one.ratio == pytest.approx(2 / 1.5, rel=1e-9)
+
+
+def test_the_interval_is_never_narrower_than_noise_alone_makes_it() -> None:
+    p = complete(1)
+    found = adequacy(p, with_errors(p, np.full(len(p.windows), 2.0)), 0)
+    draws = p.noise_errors(with_errors(p, np.ones(len(p.windows))), 1, draws=400)
+    least, most = np.quantile(np.median(draws, axis=1) / np.median(draws), [0.025, 0.975])
+    assert found.ratio / found.low == pytest.approx(most, abs=0.01)
+    assert found.ratio / found.high == pytest.approx(least, abs=0.01)
+
+
+def test_few_windows_of_noise_are_adequate() -> None:
+    """Two blocks, resampled, can only be one, the other, or both."""
+    p = complete(3)
+    few = Problem(p.simulation, p.windows.take(np.flatnonzero(p.windows.block < 2)), p.scales)
+    assert len(few.windows) < 8
+    none = with_errors(few, np.ones(len(few.windows)))
+    draws = few.noise_errors(none, 1000, draws=200)
+    found = [adequacy(few, with_errors(few, errors), 0) for errors in draws]
+    assert np.mean([a.adequate for a in found]) >= 0.95
+    assert np.mean([a.low <= 1.0 <= a.high for a in found]) >= 0.9
 
 
 def test_the_ratio_is_the_same_for_a_seed() -> None:
