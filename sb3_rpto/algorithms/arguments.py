@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from numbers import Integral
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms.bookkeeping import TwoWorlds
+from sb3_rpto.algorithms.worlds import members
 from sb3_rpto.dynamics.factory import BACKENDS, is_mujoco
 from sb3_rpto.dynamics.weights import WEIGHTINGS
 from sb3_rpto.effects import LIBRARY
@@ -32,6 +35,13 @@ DYNAMICS_ARGUMENTS = frozenset(
         "model_train_freq",
     }
 )
+#: What :func:`check_values` looks at beside the name of the dynamics.
+CHECKED = (
+    *("weighting", "rollout_start", "real_ratio", "weight_floor", "tau", "gamma", "source_steps", "model_train_freq"),
+    *("gradient_steps", "target_update_interval", "batch_size", "buffer_size"),
+)
+#: Policy updates that are too few for anything to be learned.
+FEW_UPDATES = 1_000
 #: Goals, Dict observations and n-step returns (SB3's HerReplayBuffer is a DictReplayBuffer).
 UNSUPPORTED_BUFFERS = (DictReplayBuffer, NStepReplayBuffer)
 
@@ -91,8 +101,12 @@ def check_values(
     rollout_start: str,
     real_ratio: float,
     weight_floor: float,
+    tau: float,
+    gamma: float,
     source_steps: Any,
     model_train_freq: Any,
+    gradient_steps: Any,
+    target_update_interval: Any,
     batch_size: Any,
     buffer_size: Any,
 ) -> None:
@@ -111,17 +125,31 @@ def check_values(
         raise ValueError(f"real_ratio must lie in [0, 1), got {real_ratio}")
     if weight_floor < 0:
         raise ValueError(f"weight_floor must not be negative, got {weight_floor}")
-    positive = {"source_steps": source_steps, "model_train_freq": model_train_freq}
-    for name, value in {**positive, "batch_size": batch_size, "buffer_size": buffer_size}.items():
+    for name, share, lowest in (("tau", tau, "above 0"), ("gamma", gamma, "at least 0")):
+        if not 0 <= share <= 1 or (name == "tau" and share == 0):
+            raise ValueError(f"{name} must be {lowest} and at most 1, got {share!r}")
+    if not _is_integer(gradient_steps) or gradient_steps < -1:
+        raise ValueError(f"gradient_steps must be an integer from 0, or -1 (one a target step), got {gradient_steps!r}")
+    for name, value in {
+        "source_steps": source_steps,
+        "model_train_freq": model_train_freq,
+        "target_update_interval": target_update_interval,
+        "batch_size": batch_size,
+        "buffer_size": buffer_size,
+    }.items():
         if not _is_integer(value) or value < 1:
             raise ValueError(f"{name} must be a positive integer, got {value!r}")
 
 
-def check_something_to_fit(config: dict[str, Any], close_loop: bool | Sequence[str]) -> None:
-    """Refuse a physical model without parameters, and a closed loop without a MuJoCo simulator or known effects.
+def check_something_to_fit(
+    config: dict[str, Any], close_loop: bool | Sequence[str], traces_log: bool, passed: Collection[str]
+) -> None:
+    """Refuse a physical model without parameters, what it has no use for, and a loop that cannot be closed.
 
     :param config: of the dynamics
     :param close_loop: whether, or the kinds of effects to look for
+    :param traces_log: measurements stand in for the target
+    :param passed: names of the arguments that the user passed
     :raises ValueError: with the remedy
     :raises TypeError: for a single kind
     """
@@ -134,6 +162,16 @@ def check_something_to_fit(config: dict[str, Any], close_loop: bool | Sequence[s
     if close_loop is not False and not mujoco:
         raise ValueError(
             "close_loop=True traces what a MuJoCo simulator lacks: pass dynamics='physical' and a gymnasium MuJoCo env"
+        )
+    if mujoco and "rollout_start" in passed:
+        raise ValueError(
+            "rollout_start is for one-step branches; dynamics='physical' simulates whole episodes: leave it out"
+        )
+    if mujoco and config.get("effects") and (close_loop is not False or traces_log):
+        raise ValueError(
+            "dynamics_kwargs['effects'] and a trace exclude each other: a trace begins at the bare simulator, and what "
+            "it finds takes the place of these; leave them out and name their kinds in close_loop=[...], or write "
+            "what the MJCF can hold into it"
         )
     if mujoco and not close_loop and not config.get("declared") and not config.get("effects"):
         raise ValueError(
@@ -191,6 +229,7 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
     needs_rewards = model._offline and model.weighting is not None and not model._traces_log
     if needs_rewards and not model.replay_buffer.target.rewards.any():
         raise ValueError("target_data holds no rewards, which RTO's weight needs; pass weighting=None")
+    _warn_of_little(model, total_timesteps)
     capacity = model.replay_buffer.target.buffer_size
     if model.target_env is not None and total_timesteps > capacity:
         warnings.warn(
@@ -198,6 +237,53 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
             'replay_buffer_kwargs={"target_size": ...} to keep them all',
             stacklevel=3,
         )
+
+
+def _warn_of_little(model: TwoWorlds, total_timesteps: int) -> None:
+    """Say so where the budget ends before the dynamics are fitted, or with next to no updates."""
+    if model.updates_dynamics and not model._offline:
+        first = model.model_train_freq
+        seen = model.replay_buffer.target.size()
+        if total_timesteps + seen < first:
+            warnings.warn(
+                f"total_timesteps={total_timesteps} ends before the first fit of the dynamics, after {first} target "
+                "steps; raise it, or lower model_train_freq",
+                stacklevel=4,
+            )
+    if model._offline:
+        rounds = -(-total_timesteps // int(model.source_steps))
+        updates = rounds * max(model.gradient_steps, 1)
+        if updates < FEW_UPDATES <= total_timesteps:
+            warnings.warn(
+                f"total_timesteps={total_timesteps} source steps are {rounds} rounds of source_steps="
+                f"{model.source_steps} with gradient_steps={model.gradient_steps} updates each, {updates} in all; "
+                "raise gradient_steps or total_timesteps",
+                stacklevel=4,
+            )
+
+
+def check_callbacks(callback: BaseCallback, target_env: VecEnv | None) -> None:
+    """Refuse a callback that evaluates in the target that D_target is collected from.
+
+    Its steps would be counted nowhere, and the episode under way would jump.
+
+    :raises ValueError: naming the callback
+    """
+    for one in _callbacks(callback):
+        evaluated = getattr(one, "eval_env", None)
+        if isinstance(evaluated, VecEnv) and target_env is not None and members(evaluated) & members(target_env):
+            raise ValueError(
+                f"{type(one).__name__} evaluates in target_env itself, so the episode that D_target is collected from "
+                "would jump; give it an environment of its own"
+            )
+
+
+def _callbacks(callback: BaseCallback) -> Iterator[BaseCallback]:
+    yield callback
+    parts = [*getattr(callback, "callbacks", []), getattr(callback, "callback", None)]
+    for part in parts:
+        if isinstance(part, BaseCallback):
+            yield from _callbacks(part)
 
 
 def _is_integer(value: Any) -> bool:

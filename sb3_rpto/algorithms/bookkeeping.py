@@ -123,6 +123,9 @@ class TwoWorlds(PolicySnapshots):
             self._check_pair(self.env, venv)
         if self.target_env is not None:  # what the last target told holds for it alone
             self.forget_best()
+            for earned in (self.ep_info_buffer, self.ep_success_buffer):
+                if earned is not None:
+                    earned.clear()
             if self.loop is not None:
                 self.loop.forget_target()
             if self.replay_buffer.target.size() > 0:

@@ -217,7 +217,8 @@ class TransferAlgorithm(Resumable):
                 self.dynamics_config = dynamics_config(
                     self.dynamics_backend, self.env, self.dynamics_kwargs, self.declared
                 )
-                arguments.check_something_to_fit(self.dynamics_config, self.close_loop)
+                traces_log = self.measured is not None
+                arguments.check_something_to_fit(self.dynamics_config, self.close_loop, traces_log, self._passed)
                 arguments.check_rules(self.dynamics_kwargs, self.observation_space, self.action_space)
             self._setup_model()
             if target_env is not None:
@@ -243,17 +244,8 @@ class TransferAlgorithm(Resumable):
 
     def _check_arguments(self) -> None:
         arguments.check_applicable(type(self).__name__, self.updates_dynamics, self._passed)
-        arguments.check_values(
-            dynamics=self.dynamics_backend,
-            weighting=self.weighting,
-            rollout_start=self.rollout_start,
-            real_ratio=self.real_ratio,
-            weight_floor=self.weight_floor,
-            source_steps=self.source_steps,
-            model_train_freq=self.model_train_freq,
-            batch_size=self.batch_size,
-            buffer_size=self.buffer_size,
-        )
+        checked = {name: getattr(self, name) for name in arguments.CHECKED}
+        arguments.check_values(dynamics=self.dynamics_backend, **checked)
 
     def _setup_model(self) -> None:
         """Build networks, buffers and dynamics from the spaces alone: ``load()`` has no environment."""
@@ -345,6 +337,7 @@ class TransferAlgorithm(Resumable):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
+        arguments.check_callbacks(callback, self.target_env)
         self._source_world = self._source_world or self._make_source_world()
         trace_log(self)  # first of all: the log may be refused
         if not self._warm:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import pathlib
 import warnings
 from collections.abc import Sequence
@@ -43,13 +44,16 @@ def carried_arguments(sac: SAC) -> dict[str, Any]:
 def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
     """The source model itself, or from its zip.
 
+    :raises TypeError: for a model of another kind
     :raises ValueError: for a zip that SAC cannot load
     """
     if isinstance(source_model, SAC):
         return source_model
+    if not isinstance(source_model, str | os.PathLike):
+        raise TypeError(f"source_model must be a SAC or the path of its zip, not {type(source_model).__name__}")
     try:
         return SAC.load(source_model, device=device)
-    except (KeyError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"source_model={str(source_model)!r} is not the zip of a SAC ({error}); a model of this package goes on "
             "with its own class's load()"

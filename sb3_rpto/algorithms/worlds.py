@@ -13,6 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 
+from sb3_rpto.envs.observations import layers
 from sb3_rpto.envs.state import accepts_seed, copy_env, restore_state, save_state
 
 
@@ -127,10 +128,16 @@ def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) ->
 def check_pair(source: VecEnv, target: VecEnv) -> None:
     """Refuse a target that cannot be the source's target.
 
-    :raises ValueError: for the same environment object, unequal spaces, or a target with statistics of its own
+    :raises ValueError: for the same environment object, unequal spaces, or statistics of one world alone
     """
-    if _members(source) & _members(target):
+    if members(source) & members(target):
         raise ValueError("target_env is env: both worlds would step the same object; build a second environment")
+    for name, world in (("env", source), ("target_env", target)):
+        if any(isinstance(layer, gym.wrappers.NormalizeObservation) for env in _inside(world) for layer in layers(env)):
+            raise ValueError(
+                f"{name} is in gymnasium's NormalizeObservation, whose statistics are each world's own and drift; wrap "
+                "env (the source) in stable_baselines3's VecNormalize instead, the target then shares its statistics"
+            )
     for name in ("observation_space", "action_space"):
         of_source, of_target = getattr(source, name), getattr(target, name)
         if of_source != of_target:
@@ -167,10 +174,14 @@ def check_finite(world: str, **arrays: np.ndarray) -> None:
             )
 
 
-def _members(venv: VecEnv) -> set[int]:
-    inner = venv.unwrapped
-    envs = getattr(inner, "envs", None)
-    return {id(inner)} if envs is None else {id(env.unwrapped) for env in envs}
+def members(venv: VecEnv) -> set[int]:
+    """Identities of the environments that a VecEnv steps; its own where they are in other processes."""
+    return {id(env.unwrapped) for env in _inside(venv)} or {id(venv.unwrapped)}
+
+
+def _inside(venv: VecEnv) -> list[gym.Env]:
+    """The environments that are in this process."""
+    return list(getattr(venv.unwrapped, "envs", []))
 
 
 class NullShiftCheck:

@@ -169,10 +169,14 @@ def _check(method: str, settings: dict[str, Any], source_model: str, target: opt
 
 
 def _known_settings(method: str) -> set[str]:
-    """Names that a method takes.
+    """Names that a method takes, without those that the command gives itself.
 
     :raises ImportError: without sb3-contrib, where it is needed
     """
+    return _constructor_names(method) - {"policy", "env", "target_env", "target_data", "seed", "device"}
+
+
+def _constructor_names(method: str) -> set[str]:
     from stable_baselines3 import SAC
 
     from sb3_rpto.zoo.settings import ALGORITHMS

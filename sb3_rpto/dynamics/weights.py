@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Literal, get_args
 
 import torch as th
@@ -42,12 +43,27 @@ def rto_weights(
             predicted = dynamics.step(data.observations, data.actions, deterministic=True)
             alive = 1.0 - data.terminations.float()
             expected_alive = 1.0 - predicted.terminations.float()
-            raw = expected_alive * soft_value(predicted.next_observations) - alive * soft_value(data.next_observations)
+            with same_noise(data.observations.device):
+                predicted_value = soft_value(predicted.next_observations)
+            with same_noise(data.observations.device):
+                value = soft_value(data.next_observations)
+            raw = expected_alive * predicted_value - alive * value
         else:
             raw = data.rewards + gamma * (1.0 - data.terminations) * soft_value(data.next_observations)
             if weighting == "centred":
                 raw = raw - q_value(data.observations, data.actions)
         return normalise(raw.square(), floor)
+
+
+@contextmanager
+def same_noise(device: th.device) -> Iterator[None]:
+    """Draw the same random numbers in every such block, and leave those outside as they would be.
+
+    V is drawn from one action; of a difference of two, different draws would be most.
+    """
+    with th.random.fork_rng([device] if device.type == "cuda" else []):
+        th.manual_seed(0)
+        yield
 
 
 def normalise(weights: th.Tensor, floor: float) -> th.Tensor:

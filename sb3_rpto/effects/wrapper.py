@@ -135,6 +135,18 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         self._memory, self._past = [{} for _ in self._commanding], []
         return self.env.reset(seed=seed, options=options)
 
+    def render(self) -> Any:
+        """The wrapped environment's picture.
+
+        :raises RuntimeError: it is a copy, which draws none
+        """
+        if getattr(self.unwrapped, "mujoco_renderer", self) is None:
+            raise RuntimeError(
+                "a corrected copy draws no pictures; for those CorrectedEnv(gym.make(..., render_mode='rgb_array'), "
+                "effects)"
+            )
+        return self.env.render()
+
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the wrapped environment.
 

@@ -165,9 +165,10 @@ def state_map(env: gym.Env) -> StateMap:
         known = author.__module__.startswith("gymnasium.envs.mujoco.")
         make = _TASKS.get(author.__name__.removesuffix("Env")) if known else None
         if make is None:
+            key = type(base).__name__ if env.spec is None else repr(name)
             raise ValueError(
                 f"{name}: how its observations (written by {author.__name__}._get_obs) follow from the state is not "
-                f"known; tell it with register_state_map({name!r}, ...), or record qpos and qvel and read them with "
+                f"known; tell it with register_state_map({key}, ...), or record qpos and qvel and read them with "
                 "Measurements.from_tables"
             )
     return StateMap(name, (model.nq, model.nv), shape[0], make(env))

@@ -118,6 +118,9 @@ def _coordinates(joint: str, names: list[str]) -> list[str]:
 
 
 def _near(name: str) -> str:
+    for prefix in PREFIXES:
+        if name.startswith(prefix) and len(name) > len(prefix) + 1 and not name[len(prefix)].isalnum():
+            return f"did you mean '{prefix}.{name[len(prefix) + 1 :]}'?"
     prefix, dot, rest = name.partition(".")
     choices = [*PLAIN, *PREFIXES]
     near = difflib.get_close_matches(prefix, choices, n=2, cutoff=0.5)

@@ -116,10 +116,13 @@ class Measurements:
 
         :param tables: for each file name, its columns, all of shape (T,): ``time`` in s, ``qpos`` in rad or m, ``qvel``
             in rad/s or m/s, ``qfrc`` in N·m or N, ``ctrl`` in the actuators' units, ``enabled`` 0 or 1, ``param`` in SI
+        :raises TypeError: a table in the place of a dict of them
         :raises ValueError: no tables; unknown, missing or differing columns, or such of unequal shape; what is no
             number, NaN or infinity; time that does not increase, too few rows; a setting or a split that changes within
             an episode, or a split of another name; the message names the place and the remedy
         """
+        if not isinstance(tables, Mapping) or any(isinstance(t, np.ndarray | list) for t in tables.values()):
+            raise TypeError("tables must be a dict of tables by their names; write {'run': table} for a single one")
         if not tables:
             raise ValueError("no tables; give at least one")
         stems = [Path(name).stem for name in tables]

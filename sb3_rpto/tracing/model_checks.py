@@ -17,7 +17,7 @@ from sb3_rpto.effects.names import object_names
 from sb3_rpto.tracing.checks import WINDOW, Finding, smoothed_velocity
 from sb3_rpto.tracing.columns import columns_of, joint_of
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.windows import discretised, stiff
+from sb3_rpto.tracing.windows import command_order, discretised, stiff
 
 ALL = "all episodes"
 SLOW = 0.02
@@ -66,7 +66,7 @@ def check_against(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     _check_actuators(model)
     _check_clock(model, data)
     _check_settings(model, data)
-    return _sampling(model, data) + _responses(model, data)
+    return _sampling(model, data) + _clipped(model, data) + _responses(model, data)
 
 
 def check_names(model: mujoco.MjModel, data: Measurements) -> None:
@@ -182,6 +182,23 @@ def _sampling(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     if step > 1.01 * SLOW and not data.exact:
         message = f"the median step is {step:.4g} s; effects faster than that, such as a short delay, leave no trace"
         found.append(Finding("slow sampling", f"{ALL}, time", message))
+    return found
+
+
+def _clipped(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
+    """Commands outside an actuator's range, where the simulation clips them."""
+    found = []
+    for column, (name, i) in enumerate(zip(data.columns.ctrl, command_order(model, data))):
+        low, high = model.actuator_ctrlrange[i]
+        slack = 1e-3 * (high - low)
+        commands = np.concatenate([e.ctrl[:, column] for e in data.episodes])
+        beyond = float(np.mean((commands < low - slack) | (commands > high + slack)))
+        if model.actuator_ctrllimited[i] and beyond > 0:
+            message = (
+                f"{beyond:.1%} of the samples are outside the model's ctrlrange [{low:g}, {high:g}], where it clips "
+                "them: other units, or too narrow a range?"
+            )
+            found.append(Finding("clipped command", f"{ALL}, ctrl.{name}", message))
     return found
 
 

@@ -28,6 +28,9 @@ from sb3_rpto.tracing.windows import Windows
 APART = 3.0
 #: Verdicts that leave nothing to look for.
 SETTLED = ("complete", "explained")
+#: A declared number whose interval is wider than this share of itself and of its nominal value is not determined: it
+#: spans an order of magnitude. (Where both are next to nothing: of what is plausible.)
+VAGUE = 0.9
 #: Commands one sample earlier that leave less than this share of the error were logged after they had acted.
 EARLY = 0.5
 _NEVER = "adding it lowers the error of unseen windows by nothing clear"
@@ -66,9 +69,9 @@ def trace(
     :param progress: called with the share done and what is being done
     :return: the verdict, the effects, errors before and after, and the corrected model
     :raises ValueError: data and model do not fit together, the data are too few, or an argument is out of range
-    :raises TypeError: ``declared`` or ``candidates`` is a string, not a list of them
+    :raises TypeError: ``declared`` or ``candidates`` is a string, not a list of them; data that were not read
     """
-    _check_arguments(seed, candidates, horizon, calibrate, threads)
+    _check_arguments(data, seed, candidates, horizon, calibrate, threads)
     say = _steady(progress)
     set_up = prepare(model, data, declared, seed, candidates, horizon, threads)
     sigma, fitted = set_up.sigma, set_up.fitted
@@ -111,6 +114,7 @@ def trace(
     verdict = judge(found.before, found.after, bool(selection.model.effects))
     if verdict not in SETTLED:
         findings += doubts(set_up.nominal, fitted) + _early(found, fitted)
+    findings += _undetermined(problem, final, intervals)
     findings += _strays(selector, final, set_up, seed)
     unstable = problem.unstable(final)
     if unstable:
@@ -255,6 +259,23 @@ def _strays(selector: Selector, values: np.ndarray, set_up: SetUp, seed: int) ->
     ]
 
 
+def _undetermined(problem: Problem, values: np.ndarray, intervals: np.ndarray) -> list[Finding]:
+    """Declared numbers of which the data say next to nothing: where nothing moves, or where several act alike."""
+    found = []
+    for effect, s in zip(problem.simulation.effects, problem.simulation.slices):
+        if not _is_declared(effect):
+            continue
+        value, (low, high), nominal = float(values[s][0]), intervals[:, s][:, 0], float(problem.null[s][0])
+        scale = max(abs(value), abs(nominal)) if nominal else max(abs(value), float(problem.size[s][0]))
+        if high - low > VAGUE * scale:
+            message = (
+                f"{value:.4g} [{low:.4g}, {high:.4g}]: these data do not tell it; move so that it matters, do not "
+                "declare it, or declare fewer that act alike"
+            )
+            found.append(Finding("undetermined", f"declared {effect.label}", message))
+    return found
+
+
 def _early(found: Found, data: Measurements) -> list[Finding]:
     """Commands that were logged with the sample after they acted: no actuator acts before it is told."""
     train, base = found.on.fine.train, found.base.fit
@@ -276,13 +297,17 @@ def _early(found: Found, data: Measurements) -> list[Finding]:
 
 
 def _check_arguments(
-    seed: int, candidates: Sequence[str] | None, horizon: float | None, calibrate: int, threads: int
+    data: Measurements, seed: int, candidates: Sequence[str] | None, horizon: Any, calibrate: int, threads: int
 ) -> None:
     """Refuse what would fail after minutes."""
+    if not isinstance(data, Measurements):
+        raise TypeError(
+            f"data must be Measurements, not {type(data).__name__}; read files by Measurements.from_csv(...)"
+        )
     if isinstance(candidates, str):
         raise TypeError(f"candidates must be a list of kinds, not the string {candidates!r}; write [{candidates!r}]")
-    if horizon is not None and not 0 < horizon < np.inf:
-        raise ValueError(f"horizon is {horizon:g}; give a time in s above 0, or None")
+    if horizon is not None and not (isinstance(horizon, float | int) and 0 < horizon < np.inf):
+        raise ValueError(f"horizon is {horizon!r}; give a time in s above 0, or None")
     for name, value in (("seed", seed), ("calibrate", calibrate), ("threads", threads)):
         if value < 0:
             raise ValueError(f"{name} is {value}; give a number from 0")

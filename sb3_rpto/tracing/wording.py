@@ -24,12 +24,12 @@ VERDICTS = {
         "Effects of one class act alike in these data: any of them may be the true one.",
     ),
     "partly explained": (
-        "The effects below take away at least half of the excess error, but something remains that no effect of the "
-        "library explains.",
+        "The effects below take away at least half of the excess error, but something remains that none of the effects "
+        "looked for explains.",
         "They bring the model closer to the data and are not claimed as the explanation.",
     ),
     "unexplained": (
-        "The model does not fit the data, and no effect of the library explains why.",
+        "The model does not fit the data, and none of the effects looked for explains why.",
         "Effects that are listed all the same lower the error and are not claimed as the explanation.",
     ),
 }

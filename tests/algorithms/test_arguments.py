@@ -5,11 +5,14 @@ import numpy as np
 import pytest
 from conftest import ALGORITHMS, SMALL_ENSEMBLE, pendulum, small
 from gymnasium import spaces
+from stable_baselines3 import PPO, TD3
 from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto import RPO, RPTO
 from sb3_rpto.algorithms import arguments
+from sb3_rpto.effects import LIBRARY
 
 VALUES = {
     "dynamics": "ensemble",
@@ -19,6 +22,10 @@ VALUES = {
     "weight_floor": 0.5,
     "source_steps": 20,
     "model_train_freq": 250,
+    "gradient_steps": -1,
+    "target_update_interval": 1,
+    "tau": 0.005,
+    "gamma": 1.0,
     "batch_size": 256,
     "buffer_size": 1_000,
 }
@@ -59,6 +66,13 @@ def test_what_is_allowed_passes():
         ("source_steps", "auto"),
         ("source_steps", 0),
         ("model_train_freq", 2.5),
+        ("gradient_steps", 2.5),
+        ("gradient_steps", "5"),
+        ("gradient_steps", -2),
+        ("target_update_interval", 0),
+        ("tau", 0.0),
+        ("tau", 5.0),
+        ("gamma", 1.5),
     ],
 )
 def test_a_wrong_value_is_named(name, value):
@@ -125,3 +139,61 @@ def test_a_single_declared_name_does_not_come_apart_into_letters():
     env, target = (gym.make("InvertedDoublePendulum-v5") for _ in range(2))
     with pytest.raises(TypeError, match=r"list of names, not the string 'pole.length'; write \['pole.length'\]"):
         small(RPTO, env, target, dynamics="physical", dynamics_kwargs={}, declared="pole.length")
+
+
+def physical(**kwargs):
+    env, target = (gym.make("InvertedDoublePendulum-v5") for _ in range(2))
+    return small(RPTO, env, target, dynamics="physical", **kwargs)
+
+
+def test_whole_episodes_have_no_branches_to_start():
+    with pytest.raises(ValueError, match="rollout_start is for one-step branches"):
+        physical(declared=["pole.length"], rollout_start="target", dynamics_kwargs={})
+
+
+def test_effects_that_a_trace_would_drop_are_refused():
+    given = {"effects": [LIBRARY["command_delay"]("slide", delay=0.03).to_json()]}
+    with pytest.raises(ValueError, match="a trace begins at the bare simulator"):
+        physical(close_loop=["spring"], dynamics_kwargs=given)
+    assert physical(dynamics_kwargs=given).dynamics.names == ["command_delay(slide).delay"]
+
+
+@pytest.mark.parametrize("normalised", [0, 1])
+def test_statistics_of_one_world_alone_are_refused(normalised):
+    worlds = [pendulum(), pendulum(12.0)]
+    worlds[normalised] = gym.wrappers.NormalizeObservation(worlds[normalised])
+    with pytest.raises(ValueError, match=r"NormalizeObservation.*VecNormalize"):
+        small(RPO, *worlds)
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_callback_that_evaluates_in_the_target_itself_is_refused(nested):
+    target = Monitor(pendulum(12.0))
+    model = small(RPO, pendulum(), target)
+    callback = EvalCallback(target, eval_freq=10, verbose=0)
+    with pytest.raises(ValueError, match="EvalCallback evaluates in target_env itself"):
+        model.learn(20, callback=[EveryNTimesteps(5, callback)] if nested else callback, source_timesteps=0)
+    assert model.target_spent == {}
+    model.learn(20, callback=EvalCallback(Monitor(pendulum(12.0)), eval_freq=10, verbose=0), source_timesteps=0)
+
+
+def test_a_budget_that_ends_before_the_first_fit_is_told():
+    with pytest.warns(UserWarning, match="total_timesteps=20 ends before the first fit.*lower model_train_freq"):
+        small(RPTO, model_train_freq=50).learn(20, source_timesteps=40)
+
+
+def test_next_to_no_updates_offline_are_told():
+    model = small(RPTO, source_steps=400, gradient_steps=5)
+    model._offline = True
+    with pytest.warns(UserWarning, match="3 rounds of source_steps=400 with gradient_steps=5 updates each, 15 in all"):
+        arguments._warn_of_little(model, 1_200)
+
+
+@pytest.mark.parametrize(("agent", "error"), [(PPO, TypeError), (TD3, TypeError)])
+def test_a_source_model_of_another_kind_is_refused(agent, error, tmp_path):
+    other = agent("MlpPolicy", pendulum(), policy_kwargs={"net_arch": [4]})
+    with pytest.raises(error, match=f"source_model must be a SAC.*not {agent.__name__}"):
+        RPTO.from_source(other, pendulum(), pendulum(12.0))
+    other.save(tmp_path / "other.zip")
+    with pytest.raises(ValueError, match="is not the zip of a SAC"):
+        RPTO.from_source(tmp_path / "other.zip", pendulum(), pendulum(12.0))

@@ -89,3 +89,14 @@ def test_action_noise_takes_the_width_of_the_target(widths):
         model.set_target_env(DummyVecEnv(second))
     model.learn(12, reset_num_timesteps=False)
     assert model.num_timesteps == 24
+
+
+def test_the_best_policy_of_a_target_is_judged_by_its_own_episodes():
+    model = small(RPO, short(10.0), gym.wrappers.TransformReward(short(12.0), lambda r: 0.01 * r))
+    model.learn(140, source_timesteps=0)
+    assert np.isfinite(model.best_mean_reward)
+    with pytest.warns(UserWarning, match="D_target loses"):
+        model.set_target_env(short(12.0))
+    model.learn(140, reset_num_timesteps=False)
+    earned = [info["r"] for info in model.ep_info_buffer]
+    assert model.best_mean_reward == pytest.approx(max(np.mean(earned[i : i + 5]) for i in range(len(earned) - 4)))

@@ -93,3 +93,20 @@ def test_equal_weights_where_all_are_the_same():
     assert normalise(th.full((4,), 3.0), 0.5).unique().numel() == 1
     assert effective_sample_size(th.ones(4)) == 4
     assert effective_sample_size(th.tensor([1.0, 0.0, 0.0])) == 1
+
+
+def test_a_drawn_value_does_not_make_a_perfect_model_look_wrong():
+    """V is drawn from one action: the same for s' and for its prediction, or their difference is mostly that draw."""
+
+    def drawn(observations):
+        return value(observations) + th.randn(len(observations))
+
+    still = Transitions(
+        DATA.observations, DATA.actions, DATA.rewards, DATA.observations, th.zeros_like(DATA.terminations)
+    )
+    th.manual_seed(3)
+    weights = rto_weights("value_aware", still, Shift(0.0), drawn, q, gamma=0.9, floor=0.25)
+    th.testing.assert_close(weights, th.full((3,), 1.25))
+    after = th.randn(4)
+    th.manual_seed(3)
+    th.testing.assert_close(after, th.randn(4))  # who draws afterwards draws as ever

@@ -449,3 +449,15 @@ def test_simple_pendulum_loads_with_its_quantised_velocity():
     assert len(data.episodes) == 4
     assert kinds(data).count("quantised velocity") == 4
     assert not {"flipped velocity", "velocity slope", "wrapped angle", "gap"} & set(kinds(data))
+
+
+@pytest.mark.parametrize("tables", [{"time": np.arange(9.0), "qpos.hinge": np.arange(9.0)}, [1.0], "runs.csv"])
+def test_a_table_in_the_place_of_tables_is_refused(tables):
+    with pytest.raises(TypeError, match="for a single one"):
+        Measurements.from_tables(tables)
+
+
+@pytest.mark.parametrize("name", ["qpos_hinge", "qpos-hinge", "qpos/hinge"])
+def test_another_mark_than_a_dot_is_seen(name):
+    with pytest.raises(ValueError, match=r"did you mean 'qpos\.hinge'"):
+        Measurements.from_tables({"run": {"time": np.arange(9.0), name: np.arange(9.0)}})

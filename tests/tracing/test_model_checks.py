@@ -231,3 +231,14 @@ def test_a_ball_joint_is_no_hinge():
     data = Measurements.from_tables({"run": {"time": time, "qpos.elbow": np.sin(time)}})
     with pytest.raises(ValueError, match=r"has the columns elbow, the model needs elbow.0, elbow.1"):
         check_against(ball, data)
+
+
+def test_commands_that_the_model_clips():
+    told = simulate(model_of(), 0)
+    limited = KINDS["motor"].replace('gear="2"', 'gear="2" ctrlrange="-0.5 0.5" ctrllimited="true"')
+    model = mujoco.MjModel.from_xml_string(ARM.replace("ACTUATORS", limited))
+    data = Measurements.from_tables({"run": told})
+    (finding,) = (f for f in check_against(model, data) if f.kind == "clipped command")
+    assert finding.where == "all episodes, ctrl.first"
+    share = np.mean(np.abs(told["ctrl.first"]) > 0.501)
+    assert finding.message.startswith(f"{share:.1%} of the samples are outside the model's ctrlrange [-0.5, 0.5]")

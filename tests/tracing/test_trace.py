@@ -12,7 +12,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from simulated import PENDULUM, WITH_WHEEL, compiled, recorded
+from simulated import PENDULUM, RATE, WITH_WHEEL, briefly, compiled, recorded
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_rpto.effects.carry import load_corrected
@@ -386,3 +386,21 @@ def test_how_test_runs_were_sampled_changes_nothing_of_the_fit() -> None:
         assert getattr(ours, name).model.opt.timestep == getattr(theirs, name).model.opt.timestep
     np.testing.assert_array_equal(ours.sigma, theirs.sigma)
     assert (ours.length, ours.longer, ours.scales) == (theirs.length, theirs.longer, theirs.scales)
+
+
+def test_declared_numbers_of_which_the_data_tell_nothing_are_named() -> None:
+    rng, n = np.random.default_rng(0), 400
+    still = {f"r{i}": {"time": np.arange(n) / RATE, "qpos.hinge": 1e-4 * rng.standard_normal(n)} for i in range(3)}
+    data = Measurements.from_tables({name: {**t, "ctrl.motor": np.zeros(n)} for name, t in still.items()})
+    report = briefly(PENDULUM, data, ["hinge.damping", "pole.mass"], candidates=[])
+    assert [f.where for f in report.findings if f.kind == "undetermined"] == [
+        "declared hinge.damping",
+        "declared pole.mass",
+    ]
+    moved = briefly(PENDULUM, recorded(), ["hinge.damping", "pole.mass"], candidates=[])
+    assert "undetermined" not in {f.kind for f in moved.findings}
+
+
+def test_data_that_were_not_read_are_refused_at_once() -> None:
+    with pytest.raises(TypeError, match="data must be Measurements, not str"):
+        trace(PENDULUM, "runs/*.csv")  # type: ignore[arg-type]
