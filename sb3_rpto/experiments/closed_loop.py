@@ -217,7 +217,8 @@ def _read(task: str, truth: dict[str, float], model: Any) -> dict[str, Any]:
     if model.loop is not None and model.loop.found:
         last = model.loop.found[-1]
         row["verdict"] = last["verdict"]
-        row["named"] = "; ".join(sorted(set(dynamics.names) - set(truth)))
+        declared = {e.label for e in dynamics.effects() if isinstance(e, Declared)}
+        row["named"] = "; ".join(sorted(set(dynamics.names) - declared))
     return row
 
 
