@@ -27,9 +27,9 @@ from sb3_rpto.algorithms.source import SourceWorld
 from sb3_rpto.algorithms.worlds import (
     NullShiftCheck,
     TargetLedger,
+    check_environment,
     check_finite,
     check_pair,
-    check_seedable,
     find_ledger,
     share_normalisation,
 )
@@ -114,10 +114,11 @@ class TwoWorlds(PolicySnapshots):
         :param env: an environment, a VecEnv or an id
         :raises ValueError: when it is the source itself, has other spaces, cannot be reset with a seed, or is another
             machine (joints, length of a step) than the simulator that is fitted to it
+        :raises TypeError: for what is no environment
         """
         if isinstance(env, str):
             env = gym.make(env)
-        check_seedable(env, "target_env")
+        check_environment(env, "target_env")
         venv = self._wrap_env(env, self.verbose)
         if self.env is not None:
             self._check_pair(self.env, venv)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import cloudpickle
+import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
@@ -89,7 +90,7 @@ class Resumable(TwoWorlds):
     def load(
         cls: type[Self],
         path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         *args: Any,
         target_env: GymEnv | str | None = None,
         **kwargs: Any,
@@ -97,13 +98,13 @@ class Resumable(TwoWorlds):
         """Load a checkpoint; without environments the model can predict, with them it resumes.
 
         :param path: of the zip
-        :param env: the source
+        :param env: the source, or its id
         :param args: as SB3's ``load``
-        :param target_env: the target
+        :param target_env: the target, or its id
         :param kwargs: as SB3's ``load``
         :raises ValueError: for a file that another algorithm saved
         """
-        model = super().load(path, env, *args, **kwargs)
+        model = super().load(path, gym.make(env) if isinstance(env, str) else env, *args, **kwargs)
         if model._resume_state is None:
             raise ValueError(
                 f"{path} was not saved by {cls.__name__}; start from a SAC model by "

@@ -22,7 +22,7 @@ from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.algorithms.closing import LoopCloser, trace_log
 from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_world
-from sb3_rpto.algorithms.worlds import check_seedable, check_spaces, find_ledger
+from sb3_rpto.algorithms.worlds import check_environment, check_spaces, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics
@@ -136,8 +136,8 @@ class TransferAlgorithm(Resumable):
         if isinstance(env, str):
             env = gym.make(env)
         if env is not None:  # SB3's load() builds the object before it has an env
+            check_environment(env, "env")
             check_spaces(env.observation_space, env.action_space)
-            check_seedable(env, "env")
         arguments.check_one_target(target_env, target_data)
         arguments.check_supported(n_steps, optimize_memory_usage, replay_buffer_class)
         super().__init__(

@@ -150,11 +150,17 @@ def check_pair(source: VecEnv, target: VecEnv) -> None:
         )
 
 
-def check_seedable(env: gym.Env | VecEnv, name: str) -> None:
-    """Refuse an environment that cannot be reset with a seed.
+def check_environment(env: gym.Env | VecEnv, name: str) -> None:
+    """Refuse what is no environment, and one that cannot be reset with a seed.
 
+    :raises TypeError: naming the argument
     :raises ValueError: naming the argument
     """
+    if not isinstance(env, gym.Env | VecEnv):
+        raise TypeError(
+            f"{name} must be a gymnasium environment, a VecEnv or an id, not {type(env).__name__}; call what makes "
+            "one, stack several by make_vec_env, and pass recordings as target_data="
+        )
     if isinstance(env, gym.Env) and not accepts_seed(env):
         raise ValueError(
             f"{name}: reset() of {env} takes no seed=; give it the signature reset(self, *, seed=None, options=None)"

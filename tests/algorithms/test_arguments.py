@@ -197,3 +197,18 @@ def test_a_source_model_of_another_kind_is_refused(agent, error, tmp_path):
     other.save(tmp_path / "other.zip")
     with pytest.raises(ValueError, match="is not the zip of a SAC"):
         RPTO.from_source(tmp_path / "other.zip", pendulum(), pendulum(12.0))
+
+
+@pytest.mark.parametrize("given", [pendulum, [pendulum]])
+@pytest.mark.parametrize("name", ["env", "target_env"])
+def test_what_is_no_environment_is_refused(name, given):
+    worlds = {"env": pendulum(), "target_env": pendulum(12.0), name: given}
+    with pytest.raises(TypeError, match=rf"^{name} must be a gymnasium environment.*not {type(given).__name__}"):
+        RPO("MlpPolicy", **worlds)
+
+
+def test_load_takes_ids_as_the_constructor_does(tmp_path):
+    small(RPO).save(tmp_path / "model.zip")
+    model = RPO.load(tmp_path / "model.zip", "Pendulum-v1", target_env="Pendulum-v1")
+    assert model.env is not None
+    assert model.target_env is not None
