@@ -128,8 +128,8 @@ def check_values(
     for name, share, lowest in (("tau", tau, "above 0"), ("gamma", gamma, "at least 0")):
         if not 0 <= share <= 1 or (name == "tau" and share == 0):
             raise ValueError(f"{name} must be {lowest} and at most 1, got {share!r}")
-    if not _is_integer(gradient_steps) or gradient_steps < -1:
-        raise ValueError(f"gradient_steps must be an integer from 0, or -1 (one a target step), got {gradient_steps!r}")
+    if not _is_integer(gradient_steps):
+        raise ValueError(f"gradient_steps must be an integer (negative: one a target step), got {gradient_steps!r}")
     for name, value in {
         "source_steps": source_steps,
         "model_train_freq": model_train_freq,

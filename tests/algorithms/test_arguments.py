@@ -68,7 +68,6 @@ def test_what_is_allowed_passes():
         ("model_train_freq", 2.5),
         ("gradient_steps", 2.5),
         ("gradient_steps", "5"),
-        ("gradient_steps", -2),
         ("target_update_interval", 0),
         ("tau", 0.0),
         ("tau", 5.0),
