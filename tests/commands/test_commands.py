@@ -277,6 +277,7 @@ BAD = {
     "transfer A/model.zip rpto/ContinuousCartPole-v0 --out O": "is the source itself",
     "transfer A/model.zip Pendulum-v1 --out O": "--source ID",
     "transfer A/model.zip rpto/InvertedDoublePendulum-target0-v0 --out O": "name its task's agent",
+    "transfer A/model.zip T --out O --set device=cpu": "--set device: there is no such argument",
     "transfer A/model.zip T --out O --set weigting=paper": "did you mean 'weighting'",
     "transfer A/model.zip T --out O --set weighting=papre": "weighting='papre'",
     "transfer A/model.zip T --out O --method sac-warm --set gama=1": "did you mean 'gamma'",

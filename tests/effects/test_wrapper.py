@@ -372,6 +372,12 @@ def test_a_copy_has_effects_of_its_own():
     assert_same(run(twin, actions), run(gym.make(POLE), actions))
 
 
+def test_a_copy_says_that_it_draws_no_pictures():
+    original = CorrectedEnv(gym.make(POLE, render_mode="rgb_array"), [])
+    with pytest.raises(RuntimeError, match=r"a corrected copy draws no pictures.*render_mode='rgb_array'"):
+        copy_env(original).render()
+
+
 # --- effects on top of effects ----------------------------------------------------------------------------------------
 
 
