@@ -125,9 +125,10 @@ def check_values(
         raise ValueError(f"real_ratio must lie in [0, 1), got {real_ratio}")
     if weight_floor < 0:
         raise ValueError(f"weight_floor must not be negative, got {weight_floor}")
-    for name, share, lowest in (("tau", tau, "above 0"), ("gamma", gamma, "at least 0")):
-        if not 0 <= share <= 1 or (name == "tau" and share == 0):
-            raise ValueError(f"{name} must be {lowest} and at most 1, got {share!r}")
+    if not 0 < tau <= 1:
+        raise ValueError(f"tau must lie in (0, 1], got {tau!r}")
+    if not 0 <= gamma <= 1:
+        raise ValueError(f"gamma must lie in [0, 1], got {gamma!r}")
     if not _is_integer(gradient_steps):
         raise ValueError(f"gradient_steps must be an integer (negative: one a target step), got {gradient_steps!r}")
     for name, value in {
@@ -241,15 +242,6 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
 
 def _warn_of_little(model: TwoWorlds, total_timesteps: int) -> None:
     """Say so where the budget ends before the dynamics are fitted, or with next to no updates."""
-    if model.updates_dynamics and not model._offline:
-        first = model.model_train_freq
-        seen = model.replay_buffer.target.size()
-        if total_timesteps + seen < first:
-            warnings.warn(
-                f"total_timesteps={total_timesteps} ends before the first fit of the dynamics, after {first} target "
-                "steps; raise it, or lower model_train_freq",
-                stacklevel=4,
-            )
     if model._offline:
         rounds = -(-total_timesteps // int(model.source_steps))
         updates = rounds * max(model.gradient_steps, 1)
@@ -260,6 +252,12 @@ def _warn_of_little(model: TwoWorlds, total_timesteps: int) -> None:
                 "raise gradient_steps or total_timesteps",
                 stacklevel=4,
             )
+    elif model.updates_dynamics and total_timesteps + model.replay_buffer.target.size() < model.model_train_freq:
+        warnings.warn(
+            f"total_timesteps={total_timesteps} ends before the first fit of the dynamics, after "
+            f"{model.model_train_freq} target steps; raise it, or lower model_train_freq",
+            stacklevel=4,
+        )
 
 
 def check_callbacks(callback: BaseCallback, target_env: VecEnv | None) -> None:

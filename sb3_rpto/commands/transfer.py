@@ -173,10 +173,10 @@ def _known_settings(method: str) -> set[str]:
 
     :raises ImportError: without sb3-contrib, where it is needed
     """
-    return _constructor_names(method) - {"policy", "env", "target_env", "target_data", "seed", "device"}
+    return _arguments_of(method) - {"policy", "env", "target_env", "target_data", "seed", "device"}
 
 
-def _constructor_names(method: str) -> set[str]:
+def _arguments_of(method: str) -> set[str]:
     from stable_baselines3 import SAC
 
     from sb3_rpto.zoo.settings import ALGORITHMS

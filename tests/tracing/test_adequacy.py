@@ -113,6 +113,8 @@ def test_the_interval_is_that_of_resampled_blocks() -> None:
     one = adequacy(p, with_errors(p, errors), 0)
     assert one.ratio / one.low == pytest.approx(1.5, rel=1e-9)
     assert one.high / one.ratio == pytest.approx(2 / 1.5, rel=1e-9)
+    apart = Problem(p.simulation, replace(p.windows, block=np.arange(len(p.windows))), p.scales)
+    assert adequacy(apart, with_errors(p, np.full(len(errors), 2.0)), 0).low == pytest.approx(2.0, rel=0.06)
 
 
 def test_the_interval_is_never_narrower_than_noise_alone_makes_it() -> None:
