@@ -109,6 +109,12 @@ def _add_trace(commands: Commands) -> None:
         help="parameters that may be fitted: hinge.damping, pole.mass, '*.damping', arm.mass=0.2:0.9; repeatable",
     )
     parser.add_argument(
+        "--known",
+        metavar="FILE",
+        type=Path,
+        help="effects that the machine is known to have: the effects.json of an earlier trace of the same MODEL",
+    )
+    parser.add_argument(
         "--candidates", metavar="K1,K2", type=_names, help="kinds of effects to look for (default: all in the library)"
     )
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the split and the resampling (default: 0)")
@@ -135,6 +141,8 @@ def _names(text: str) -> list[str]:
 
 
 def _trace(parsed: argparse.Namespace) -> int:
+    from sb3_rpto.effects.carry import read_effects
+    from sb3_rpto.effects.model import load_model
     from sb3_rpto.tracing import figures, trace
 
     # What would fail at the end fails now, before minutes of work.
@@ -145,6 +153,7 @@ def _trace(parsed: argparse.Namespace) -> int:
         raise ValueError(f"--calibrate is {parsed.calibrate}; give a number of data sets, or 0 for none")
     model = _model(parsed.model)
     data = _recordings(parsed.files, parsed.format)
+    known = [] if parsed.known is None else read_effects(parsed.known, load_model(model)[1])
     parsed.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=parsed.out):
         pass  # can be written to
@@ -153,6 +162,7 @@ def _trace(parsed: argparse.Namespace) -> int:
             model,
             data,
             parsed.declare,
+            known=known,
             seed=parsed.seed,
             candidates=parsed.candidates,
             horizon=parsed.horizon,

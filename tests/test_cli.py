@@ -10,6 +10,7 @@ import mujoco
 import pytest
 
 from sb3_rpto import __version__, cli
+from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.experiments.planting import generate
 from sb3_rpto.tracing import wording
 
@@ -57,6 +58,16 @@ def test_trace_prints_the_report_and_writes_the_folder(files: Path, capsys: pyte
     assert {c["label"] for c in found["candidates"]} == {"coulomb_friction(hinge)"}
     assert found["seed"] == 1
     assert (files / "out" / "model.xml").is_file()
+
+
+def test_effects_are_known_from_a_file(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    known = files / "known.json"
+    known.write_text(json.dumps([CoulombFriction("hinge", level=0.05).to_json()]))
+    assert run(files, "--known", str(known), "--declare", "pole.mass,hinge.damping", "--quiet") == 0
+    assert capsys.readouterr().out == "complete\n"
+    known.write_text("verdict: complete")
+    assert run(files, "--known", str(known)) == 2
+    assert "does not describe effects; give the effects.json of an earlier trace" in error(capsys)
 
 
 def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixture[str]) -> None:

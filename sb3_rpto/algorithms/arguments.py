@@ -168,12 +168,6 @@ def check_something_to_fit(
         raise ValueError(
             "rollout_start is for one-step branches; dynamics='physical' simulates whole episodes: leave it out"
         )
-    if mujoco and config.get("effects") and (close_loop is not False or traces_log):
-        raise ValueError(
-            "dynamics_kwargs['effects'] and a trace exclude each other: a trace begins at the bare simulator, and what "
-            "it finds takes the place of these; leave them out and name their kinds in close_loop=[...], or write "
-            "what the MJCF can hold into it"
-        )
     if mujoco and not close_loop and not config.get("declared") and not config.get("effects"):
         raise ValueError(
             "dynamics='physical' has nothing to fit: pass declared=[...], names of the model's numbers such as "

@@ -14,7 +14,7 @@ from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
-from sb3_rpto.effects import Declared
+from sb3_rpto.effects import Declared, from_json
 from sb3_rpto.envs.observations import single_env
 from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Measurements, Report, trace
@@ -136,6 +136,7 @@ class LoopCloser:
             single_env(model.env),
             measured,
             self.declared,
+            known=[from_json(stored) for stored in model.dynamics_kwargs.get("effects", ())],
             seed=model.seed or 0,
             candidates=None if isinstance(self.kinds, bool) else self.kinds,
             horizon=horizon,
@@ -155,8 +156,8 @@ class LoopCloser:
     ) -> list[str]:
         """Let phi have the effects that were found, if that pays; the labels of those that are new.
 
-        A trace begins at the bare simulator: what it found is the whole explanation, so what an earlier one had found
-        and this one has not leaves phi.
+        A trace begins at the simulator with what its user knows: what it found is the whole explanation, so what an
+        earlier one had found and this one has not leaves phi.
 
         :param before: error of ``data`` without them; infinite: the report judges
         """

@@ -143,6 +143,22 @@ def load_corrected(folder: str | os.PathLike[str]) -> Corrected:
     return Corrected(model, [_rebuild(entry, model) for entry in stored["effects"]])
 
 
+def read_effects(path: str | os.PathLike[str], model: mujoco.MjModel) -> list[Effect]:
+    """The effects that an ``effects.json`` describes, declared numbers among them, as changes of the nominal model.
+
+    :param path: as :func:`save_corrected` wrote it; or a list of what :meth:`Effect.to_json` gives, in a file
+    :param model: the nominal model
+    :raises FileNotFoundError: there is no such file
+    :raises ValueError: it holds something else, or an effect that is not registered or not of this model
+    """
+    try:
+        stored = json.loads(Path(path).read_bytes())
+        entries = stored["effects"] if isinstance(stored, dict) else stored
+        return [_rebuild(entry, model) for entry in entries]
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} does not describe effects; give the effects.json of an earlier trace") from error
+
+
 def _describe(effect: Effect, model: mujoco.MjModel) -> dict[str, Any]:
     entry = effect.to_json()
     entry["values"] = {name: float(value) for name, value in entry["values"].items()}

@@ -219,6 +219,7 @@ class Declared(Effect):
     kind = "declared"
     place = "world"
     equation = "a number of the model"
+    known = True
 
     def __init__(self, model: mujoco.MjModel, name: str, bounds: tuple[float, float] | None = None) -> None:
         #: kind of object it belongs to, or ``option``

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import mujoco
@@ -88,6 +88,8 @@ class Effect:
     same: ClassVar[tuple[str, ...]] = ()
     #: where in the chain of command effects it stands; smaller is nearer the controller
     order: ClassVar[int] = 0
+    #: whether the model has it from the start: fitted like the others, and nothing asks whether it is needed
+    known: bool = False
 
     def __init__(self, on: str = "", **values: float) -> None:
         names = [p.name for p in self.parameters]
@@ -114,6 +116,20 @@ class Effect:
         low, high = ([getattr(p, bound) for p in self.parameters] for bound in ("lower", "upper"))
         clipped = np.clip(values, low, high)
         return type(self)(self.on, **{p.name: float(v) for p, v in zip(self.parameters, clipped)})
+
+    def as_known(self) -> Effect:
+        """The same effect, :attr:`known` to be there: its nulls are its values, where fits begin.
+
+        :raises ValueError: with these values it does nothing
+        """
+        if all(value == p.null for p, value in zip(self.parameters, self.values) if not p.shape):
+            raise ValueError(f"known: {self!r} does nothing; give the values that are known, or leave it to the search")
+        made = self.with_values(self.values)
+        made.known = True
+        made.parameters = tuple(  # type: ignore[misc]
+            replace(p, null=float(value)) for p, value in zip(self.parameters, self.values)
+        )
+        return made
 
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:

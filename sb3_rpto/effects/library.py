@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import mujoco
 
-from sb3_rpto.effects.declared import declare
+from sb3_rpto.effects.declared import Declared, declare
 from sb3_rpto.effects.effect import LIBRARY, Effect
-from sb3_rpto.effects.names import object_id
+from sb3_rpto.effects.names import near, object_id
 
 
 def candidates(model: mujoco.MjModel, exclude: Iterable[str] = ()) -> list[Effect]:
@@ -48,4 +48,36 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = ()) -> list[Effec
             index = 0 if kind.place in ("world", "sensor") else object_id(model, owner, on)
             if not any((owner, index, name) in declared for name in kind.same):
                 found.append(kind(on))
+    return found
+
+
+def given(model: mujoco.MjModel, declared: Sequence[str], known: Sequence[Effect] = ()) -> list[Effect]:
+    """What a model has from the start: declared numbers at their nominal values, and effects that are known beforehand.
+
+    :param model: the compiled model
+    :param declared: names, as :func:`~sb3_rpto.effects.declare` takes them
+    :param known: effects of the library with the values that are known; declared numbers among them count as declared
+    :raises ValueError: a name or an effect that the model does not have, or has twice; a known effect that does nothing
+    :raises TypeError: ``known`` holds something else
+    """
+    declare(model, declared)  # what is wrong with it is said first
+    if isinstance(known, Effect):
+        raise TypeError(f"known must be a list of effects; write [{known.label}]")
+    for effect in known:
+        if not isinstance(effect, Effect):
+            raise TypeError(
+                f"known must hold effects such as LIBRARY['command_delay']('motor', delay=0.02), not {effect!r}"
+            )
+    names = [*declared, *(effect.label for effect in known if isinstance(effect, Declared))]
+    found: list[Effect] = [*declare(model, names)]
+    everywhere, free = ({e.label for e in candidates(model, taken)} for taken in ((), names))
+    for effect in [effect for effect in known if not isinstance(effect, Declared)]:
+        label = effect.label
+        if label not in everywhere:
+            raise ValueError(f"known: no registered effect is {label!r} in this model; {near(label, everywhere)}")
+        if label not in free:
+            raise ValueError(f"known: {label!r} is a number that is declared, too; leave one of them out")
+        if label in {e.label for e in found}:
+            raise ValueError(f"known: {label!r} is there twice; leave one of them out")
+        found.append(effect.as_known())
     return found

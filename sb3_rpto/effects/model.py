@@ -73,7 +73,7 @@ def _from_env(env: gym.Env) -> tuple[mujoco.MjSpec | None, mujoco.MjModel]:
     if beyond:
         raise ValueError(
             f"env has effects already that are no numbers of its model ({', '.join(beyond)}); give the environment as "
-            "it was before them"
+            "it was before them, and to trace() these effects as known=[...]"
         )
     if callable(getattr(base, "mjcf", None)):
         spec, compiled = load_model(base.mjcf())

@@ -90,7 +90,7 @@ class Simulation:
         active = [
             (effect, values[:, s])
             for effect, s in zip(self.effects, self.slices)
-            if isinstance(effect, Declared) or np.any((values[:, s] != self.null[s])[:, self.strength[s]])
+            if effect.known or np.any((values[:, s] != self.null[s])[:, self.strength[s]])
         ]
         commands = filter_commands(active, drive.commands, self.model.opt.timestep)
         world.restore()

@@ -122,13 +122,15 @@ def _model(report: Report) -> str:
     if not report.declared:
         return "\n".join([*lines, _note("No parameter was declared: the model was taken as it is.")])
     rows = []
+    simulation = report.simulation
+    given = {e.label: simulation.null[s] for e, s in zip(simulation.effects, simulation.slices) if e.known}
     for t in report.declared:
-        nominal = float(t.effect.nominal) if isinstance(t.effect, Declared) else float("nan")
-        for value, unit, (low, high) in zip(t.effect.values, t.units, t.interval.T):
-            change = wording.percent(value / nominal - 1) if nominal else "–"
-            row = [t.label, wording.number(value), wording.interval(low, high), unit, wording.number(nominal), change]
-            rows.append(row)
-    header = ["declared parameter", "fitted", "95 % interval", "unit", "in the file", "change"]
+        rows_of = zip(t.effect.parameters, t.effect.values, given[t.label], t.units, t.interval.T)
+        for parameter, value, old, unit, (low, high) in rows_of:
+            name = t.label if isinstance(t.effect, Declared) else f"{t.label}: {parameter.name}"
+            change = wording.percent(value / old - 1) if old else "–"
+            rows.append([name, wording.number(value), wording.interval(low, high), unit, wording.number(old), change])
+    header = ["declared or known", "fitted", "95 % interval", "unit", "as given", "change"]
     return "\n".join([*lines, _table(header, rows, numbers=(1, 2, 4, 5))])
 
 

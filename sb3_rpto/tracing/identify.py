@@ -105,7 +105,7 @@ class Problem:
         self.lower = np.array([p.lower for p, _ in parameters])
         self.upper = np.array([p.upper for p, _ in parameters])
         self.null = simulation.null
-        self.declared = np.array([e.kind == "declared" for e in simulation.effects for _ in e.parameters], dtype=bool)
+        self.known = np.array([e.known for e in simulation.effects for _ in e.parameters], dtype=bool)
         self.moving = np.flatnonzero((windows.spread > 0).any(axis=0))  # coordinates of the start that are free
         self.exact, self.touching = windows.exact, windows.touching
 
@@ -173,7 +173,7 @@ class Problem:
 
     def steps(self, values: np.ndarray) -> np.ndarray:
         """Finite-difference steps of all parameters in their units, (p,), pointing inside the bounds."""
-        at_null = np.isclose(values, self.null, rtol=0, atol=1e-9 * self.size) & ~self.declared
+        at_null = np.isclose(values, self.null, rtol=0, atol=1e-9 * self.size) & ~self.known
         step = np.where(at_null, WIDE, NARROW) * self.size
         return np.where(values + step > self.upper, -step, step)
 
@@ -227,7 +227,7 @@ class Problem:
 
     def cost(self, r: np.ndarray, starts: np.ndarray, values: np.ndarray, loss: Loss) -> np.ndarray:
         """Robust cost of one or more candidates: r (..., W, R), starts (..., W, 2 nv), values (..., p)."""
-        pull = np.where(self.declared, 0.0, (values - self.null) / self.size / RIDGE) ** 2
+        pull = np.where(self.known, 0.0, (values - self.null) / self.size / RIDGE) ** 2
         return loss.energy(r, starts).sum(-1) + pull.sum(-1)
 
     def fit(
@@ -341,7 +341,7 @@ class Problem:
 
     def _normal(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced) -> tuple[np.ndarray, np.ndarray]:
         """The normal equations of all windows with the pull towards the null values, (f, f) and (f,)."""
-        pull = np.where(self.declared[free], 0.0, 1 / RIDGE**2)
+        pull = np.where(self.known[free], 0.0, 1 / RIDGE**2)
         z = (values[free] - self.null[free]) / self.size[free]
         return reduced.normal.sum(0) + np.diag(pull), reduced.gradient.sum(0) + pull * z
 

@@ -78,7 +78,7 @@ class Likes:
                 continue
             without = selector.model(rest, current.fit)
             outside = [i for i in range(len(self.effects)) if i not in rest and self.screening.excited(i)]
-            outside = [i for i in outside if self.kinds[i] != "declared"]
+            outside = [i for i in outside if not self.effects[i].known]
             for one, begin in selector.promising(without, outside):
                 selector.say(1.0, f"{self.effects[one].label} in the place of two")
                 trial = selector.model([*rest, one], begin, EXCHANGED)
@@ -170,7 +170,7 @@ class Likes:
         """Where to begin with ``new`` in the place of ``old``: where it does the likest, to first order."""
         train, simulation = self.selector.train, self.selector.simulation
         old_free, new_free = self.selector.free([old]), self.selector.free([new])
-        old_free, new_free = (f[~train.declared[f] & simulation.strength[f]] for f in (old_free, new_free))
+        old_free, new_free = (f[~train.known[f] & simulation.strength[f]] for f in (old_free, new_free))
         normal = train.linear(model.fit, np.concatenate([old_free, new_free])).normal.sum(0)
         k = len(old_free)
         z = ((model.fit.values - simulation.null) / train.size)[old_free]

@@ -9,7 +9,8 @@ from typing import Literal, TypeAlias
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects import Simulation, declare
+from sb3_rpto.effects import Effect, Simulation
+from sb3_rpto.effects.library import given
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.residuals import force_residuals, typical
@@ -28,7 +29,13 @@ Origin: TypeAlias = Literal["machine", "simulated", "exact"]
 
 
 def origin(
-    model: mujoco.MjModel, data: Measurements, declared: Sequence[str], sigma: np.ndarray, horizon: float, threads: int
+    model: mujoco.MjModel,
+    data: Measurements,
+    declared: Sequence[str],
+    sigma: np.ndarray,
+    horizon: float,
+    threads: int,
+    known: Sequence[Effect] = (),
 ) -> Origin:
     """Whether recordings seem to be a machine's, or the model's own with noise, or without any.
 
@@ -42,6 +49,7 @@ def origin(
     :param sigma: noise of each position column, (m,)
     :param horizon: length of the windows in s
     :param threads: that simulate
+    :param known: effects that it has besides, with the values to begin at
     """
     steps = {(m.opt.timestep, m.opt.integrator) for m in (model, discretised(model, data, fine=True))}
     if data.exact or len(steps) == 1:
@@ -49,9 +57,9 @@ def origin(
 
     def error(kind: Measurements, noise: np.ndarray) -> float:
         stepped = discretised(model, kind, fine=True)
-        known = declare(stepped, declared)
-        simulation = Simulation(stepped, known, threads)
-        scales = typical(simulation, force_residuals(simulation, simulation.null, kind)).scales(known)
+        there = given(stepped, declared, known)
+        simulation = Simulation(stepped, there, threads)
+        scales = typical(simulation, force_residuals(simulation, simulation.null, kind)).scales(there)
         problem = Problem(simulation, cut(stepped, kind, noise, horizon, WINDOWS), scales)
         fit = problem.fit(simulation.null, np.arange(simulation.size), iterations=ITERATIONS)
         return float(np.median(fit.errors))

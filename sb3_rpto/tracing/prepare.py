@@ -9,8 +9,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects import LIBRARY, Declared, Effect, Scales, Simulation, declare
+from sb3_rpto.effects import LIBRARY, Declared, Effect, Scales, Simulation
 from sb3_rpto.effects.library import candidates as all_candidates
+from sb3_rpto.effects.library import given
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.contacts import contact_changes
@@ -107,6 +108,7 @@ def prepare(
     kinds: Sequence[str] | None,
     horizon: float | None,
     threads: int,
+    known: Sequence[Effect] = (),
 ) -> SetUp:
     """Check the data against the model, part them, measure their noise, and set up the simulations.
 
@@ -115,6 +117,7 @@ def prepare(
     spec, compiled = load_model(model)
     data, turned = settle_turns(compiled, data)
     findings = [*data.findings, *turned, *check_against(compiled, data)]
+    given(compiled, declared, known)  # what is wrong there is said before the work
     train, select, test = data.split(seed)
     findings += [f for f in train.findings if f not in findings]
     fitted = replace(data, episodes=train.episodes + select.episodes)
@@ -125,7 +128,7 @@ def prepare(
     if touching and horizon is None:
         message = f"{changes:.1f} a second come or go; windows of {length:.2g} s, as errors about a touch-down grow"
         findings.append(Finding("contacts", "fitted runs", message))
-    seems = origin(compiled, fitted, declared, sigma, length, threads)
+    seems = origin(compiled, fitted, declared, sigma, length, threads, known)
     if seems != "machine":
         data, train, select, test, fitted = (
             replace(d, simulated=True, exact=seems == "exact") for d in (data, train, select, test, fitted)
@@ -137,15 +140,15 @@ def prepare(
     touching &= not data.exact  # those are met, or fits begin anew until they are
     train, select, test, fitted = (replace(d, touching=touching) for d in (train, select, test, fitted))
     nominal = discretised(compiled, fitted, fine=True)
-    known = declare(nominal, declared)
+    there = given(nominal, declared, known)
     if seems == "machine":
         findings += soft_friction(nominal)
     settings = {Declared(nominal, name, (-np.inf, np.inf)).number: name for name in data.columns.params}
-    for one in known:
-        if one.number in settings:
+    for one in there:
+        if isinstance(one, Declared) and one.number in settings:
             column = f"param.{settings[one.number]}"
             raise ValueError(f"declared {one.label!r} is the column {column!r} of the data, too; leave one of them out")
-    effects: list[Effect] = [*known, *_candidates(nominal, [d.label for d in known], kinds)]
+    effects = [*there, *_candidates(nominal, there, kinds)]
     fine = Simulation(nominal, effects, threads)
     scales = typical(fine, force_residuals(fine, fine.null, fitted)).scales(effects)
     rough = Simulation(discretised(compiled, fitted, fine=False), effects, threads)
@@ -153,12 +156,14 @@ def prepare(
     return SetUp(spec, compiled, findings, train, select, test, fitted, sigma, fine, rough, scales, length, longer)
 
 
-def _candidates(model: mujoco.MjModel, declared: list[str], kinds: Sequence[str] | None) -> list[Effect]:
+def _candidates(model: mujoco.MjModel, there: Sequence[Effect], kinds: Sequence[str] | None) -> list[Effect]:
     if kinds is not None:
         unknown = [k for k in kinds if k not in LIBRARY]
         if unknown:
             raise ValueError(f"candidates: no effect {unknown[0]!r} is registered; known: {', '.join(sorted(LIBRARY))}")
-    return [e for e in all_candidates(model, declared) if kinds is None or e.kind in kinds]
+    labels = {effect.label for effect in there}
+    found = all_candidates(model, [effect.label for effect in there if isinstance(effect, Declared)])
+    return [e for e in found if e.label not in labels and (kinds is None or e.kind in kinds)]
 
 
 def _horizon(data: Measurements, touching: bool) -> float:

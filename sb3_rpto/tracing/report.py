@@ -85,7 +85,7 @@ class Report:
     """The outcome of :func:`sb3_rpto.tracing.trace.trace`.
 
     :param verdict: ``complete``, ``explained``, ``partly explained`` or ``unexplained``
-    :param declared: fitted declared parameters
+    :param declared: fitted declared parameters, and the effects that were known beforehand, fitted
     :param effects: what the model lacks, with values; under ``partly explained`` and ``unexplained`` they lower the
         error and are no explanation
     :param candidates: what became of each candidate
@@ -156,8 +156,10 @@ class Report:
     def __str__(self) -> str:
         means, _ = wording.VERDICTS[self.verdict]
         lines = [f"verdict: {self.verdict}", f"  {means}", "", "model", f"  {self.equation()}"]
-        if self.declared:
-            lines += ["", "declared parameters, fitted [95 % interval]", *wording.aligned(self._values(self.declared))]
+        for what, is_number in (("declared parameters", True), ("known effects", False)):
+            given = [t for t in self.declared if isinstance(t.effect, Declared) == is_number]
+            if given:
+                lines += ["", f"{what}, fitted [95 % interval]", *wording.aligned(self._values(given))]
         if self.effects:
             claim = "it lacks" if self.verdict == "explained" else "closer to the data with, but not explained by"
             lines += ["", claim, *wording.aligned(self._values(self.effects)), *self._evidence()]
@@ -225,8 +227,8 @@ class Report:
         return rows
 
     def equation(self) -> str:
-        """The corrected model in a line, with the values found."""
-        return wording.equation([t.effect for t in self.effects])
+        """The corrected model in a line, with the values found, those of known effects among them."""
+        return wording.equation([effect for effect in self.correction if not isinstance(effect, Declared)])
 
     def to_json(self) -> dict[str, Any]:
         """Everything but the recordings, for ``report.json``, in Python's own types; None for what is not finite."""

@@ -83,7 +83,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     active = [
         (effect, values[None, s])
         for effect, s in zip(simulation.effects, simulation.slices)
-        if effect.kind == "declared" or np.any((values[s] != simulation.null[s])[simulation.strength[s]])
+        if effect.known or np.any((values[s] != simulation.null[s])[simulation.strength[s]])
     ]
     for effect, x in reversed([pair for pair in active if pair[0].senses]):
         _undo_sensor(effect, np.repeat(x, len(time), axis=0), time, qpos, qvel)

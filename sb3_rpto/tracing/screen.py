@@ -48,7 +48,7 @@ def screen(problem: Problem, fit: Fit) -> Screening:
     r, jt, jx = problem.linearise(fit.values, fit.starts, strength)
     # As if the model fitted: what noise alone would let the data show.
     reduced = problem.reduce(0 * r, jt, jx, 0 * fit.starts, Loss(3.0))
-    known = problem.declared[strength]
+    known = problem.known[strength]
     c = np.flatnonzero(~known)
     perp = _orthogonal(reduced.normal.sum(0), known)
     # Near an unstable pose everything grows alike: each window has the same say in what looks like what.
@@ -79,7 +79,7 @@ def _taken(problem: Problem, normal: np.ndarray, sensitivity: np.ndarray) -> lis
     simulation = problem.simulation
     strength = np.flatnonzero(simulation.strength)
     groups = [np.flatnonzero(np.isin(strength, np.arange(s.start, s.stop))) for s in simulation.slices]
-    declared = [e for e, effect in enumerate(simulation.effects) if effect.kind == "declared"]
+    declared = [e for e, effect in enumerate(simulation.effects) if effect.known]
     size = np.sqrt(np.maximum(np.diag(normal), 1e-12))
     likeness = np.abs(normal / size / size[:, None])
     taken: list[int | None] = []

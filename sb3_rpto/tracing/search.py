@@ -177,7 +177,7 @@ def worth_fitting(selector: Selector, screening: Screening) -> list[int]:
     """The excited candidates, one of each class."""
     chosen: list[int] = []
     for i, effect in enumerate(selector.simulation.effects):
-        if effect.kind == "declared" or not screening.excited(i):
+        if effect.known or not screening.excited(i):
             continue
         if not any(j in chosen for j in screening.alike(i)):
             chosen.append(i)

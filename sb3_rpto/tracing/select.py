@@ -121,11 +121,7 @@ class Selector:
 
     def free(self, effects: Sequence[int]) -> np.ndarray:
         """Indices of the parameters of the declared and of the given effects."""
-        keep = [
-            s
-            for i, s in enumerate(self.simulation.slices)
-            if i in effects or self.simulation.effects[i].kind == "declared"
-        ]
+        keep = [s for i, s in enumerate(self.simulation.slices) if i in effects or self.simulation.effects[i].known]
         return (
             np.concatenate([np.arange(s.start, s.stop) for s in keep]).astype(int) if keep else np.empty(0, dtype=int)
         )
@@ -177,7 +173,7 @@ class Selector:
             return self._memory[key]
         values = begin.values.copy()
         for i, s in enumerate(self.simulation.slices):
-            if i not in key and self.simulation.effects[i].kind != "declared":
+            if i not in key and not self.simulation.effects[i].known:
                 values[s] = self.simulation.null[s]
         free = self.free(key)
         fit = self.train.fit(values, free, begin.starts, iterations, tolerance=3e-3)

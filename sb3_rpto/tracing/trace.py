@@ -43,6 +43,7 @@ def trace(
     data: Measurements,
     declared: Sequence[str] = (),
     *,
+    known: Sequence[Effect] = (),
     seed: int = 0,
     candidates: Sequence[str] | None = None,
     horizon: float | None = None,
@@ -60,6 +61,9 @@ def trace(
     :param model: MJCF path, MJCF text, ``MjSpec``, ``MjModel`` or gymnasium MuJoCo environment
     :param data: recordings
     :param declared: parameters of the model that may be fitted, as :func:`sb3_rpto.effects.declare` takes them
+    :param known: effects that the machine is known to have and the model lacks, with their values so far, e.g. those
+        that an earlier trace found (``load_corrected(folder).effects``): they are fitted with the declared numbers, and
+        nothing asks whether they are needed
     :param seed: of the split, the starts and the resampling
     :param candidates: kinds of effects to look for; default: all registered ones
     :param horizon: length of the windows in s; default: 0.5, or 0.8 where there are less than 15 s of data, shorter
@@ -73,7 +77,7 @@ def trace(
     """
     _check_arguments(data, seed, candidates, horizon, calibrate, threads)
     say = _steady(progress)
-    set_up = prepare(model, data, declared, seed, candidates, horizon, threads)
+    set_up = prepare(model, data, declared, seed, candidates, horizon, threads, known)
     sigma, fitted = set_up.sigma, set_up.fitted
     found = find(
         lambda length: set_up.selectors(length, say),
@@ -260,19 +264,20 @@ def _strays(selector: Selector, values: np.ndarray, set_up: SetUp, seed: int) ->
 
 
 def _undetermined(problem: Problem, values: np.ndarray, intervals: np.ndarray) -> list[Finding]:
-    """Declared numbers of which the data say next to nothing: where nothing moves, or where several act alike."""
+    """What was given of which the data say next to nothing: where nothing moves, or where several act alike."""
     found = []
-    for effect, s in zip(problem.simulation.effects, problem.simulation.slices):
-        if not _is_declared(effect):
-            continue
-        value, (low, high), nominal = float(values[s][0]), intervals[:, s][:, 0], float(problem.null[s][0])
-        scale = max(abs(value), abs(nominal)) if nominal else max(abs(value), float(problem.size[s][0]))
+    owners = [(e, p) for e in problem.simulation.effects for p in e.parameters]
+    for i in np.flatnonzero(problem.known & problem.simulation.strength):
+        (effect, parameter), value, (low, high) = owners[i], float(values[i]), intervals[:, i]
+        scale = max(abs(value), abs(float(problem.null[i])) or float(problem.size[i]))
         if high - low > VAGUE * scale:
+            is_number = isinstance(effect, Declared)
+            where = f"declared {effect.label}" if is_number else f"known {effect.label}, {parameter.name}"
             message = (
                 f"{value:.4g} [{low:.4g}, {high:.4g}]: these data do not tell it; move so that it matters, do not "
-                "declare it, or declare fewer that act alike"
+                f"{'declare it, or declare' if is_number else 'give it, or give'} fewer that act alike"
             )
-            found.append(Finding("undetermined", f"declared {effect.label}", message))
+            found.append(Finding("undetermined", where, message))
     return found
 
 
@@ -314,12 +319,12 @@ def _check_arguments(
 
 
 def _declared(simulation: Simulation, values: np.ndarray, intervals: np.ndarray) -> list[Traced]:
-    """The declared parameters with their fitted values."""
+    """The declared parameters and the known effects with their fitted values."""
     pairs = zip(simulation.effects, simulation.slices)
     return [
         Traced(e.with_values(values[s]), units_at(e, simulation.model), intervals[:, s], [], 0.0, 0.0, 1.0)
         for e, s in pairs
-        if _is_declared(e)
+        if e.known
     ]
 
 
@@ -347,12 +352,8 @@ def _kept(
 def _fates(simulation: Simulation, screening: Screening | None, selection: Selection) -> list[Candidate]:
     """What became of each candidate."""
     labels = [e.label for e in simulation.effects]
-    candidates = [(i, e) for i, e in enumerate(simulation.effects) if not _is_declared(e)]
+    candidates = [(i, e) for i, e in enumerate(simulation.effects) if not e.known]
     return [_candidate(i, e, screening, selection, labels) for i, e in candidates]
-
-
-def _is_declared(effect: Effect) -> bool:
-    return isinstance(effect, Declared)
 
 
 def _candidate(

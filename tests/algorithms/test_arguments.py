@@ -150,11 +150,11 @@ def test_whole_episodes_have_no_branches_to_start():
         physical(declared=["pole.length"], rollout_start="target", dynamics_kwargs={})
 
 
-def test_effects_that_a_trace_would_drop_are_refused():
+@pytest.mark.parametrize("close_loop", [False, ["spring"]])
+def test_effects_that_are_known_are_trained(close_loop):
     given = {"effects": [LIBRARY["command_delay"]("slide", delay=0.03).to_json()]}
-    with pytest.raises(ValueError, match="a trace begins at the bare simulator"):
-        physical(close_loop=["spring"], dynamics_kwargs=given)
-    assert physical(dynamics_kwargs=given).dynamics.names == ["command_delay(slide).delay"]
+    made = physical(close_loop=close_loop, dynamics_kwargs=given)
+    assert made.dynamics.names == ["command_delay(slide).delay"]
 
 
 @pytest.mark.parametrize("normalised", [0, 1])

@@ -116,6 +116,21 @@ def test_an_empty_list_traces_the_declared_numbers_alone(soon: None, monkeypatch
     assert began == [80]
 
 
+def test_a_trace_knows_the_effects_that_were_passed(soon: None) -> None:
+    late = LIBRARY["command_delay"]("slide", delay=0.1)
+    passed = {"effects": [late.with_values(np.array([0.08])).to_json()]}
+    made = filled([late, *friction()], 120, dynamics_kwargs=passed)
+    made.fit_dynamics()
+    assert made.loop is not None
+    made.loop.close(made, dynamics(made))
+    report = made.loop.reports[-1]
+    assert report.verdict == "explained"
+    assert [t.label for t in report.declared] == ["pole.length", "command_delay(slide)"]
+    assert [t.label for t in report.effects] == ["coulomb_friction(slider)"]
+    assert dynamics(made).names == ["pole.length", "command_delay(slide).delay", "coulomb_friction(slider).level"]
+    assert dynamics(made).describe()["command_delay(slide).delay"] == pytest.approx(0.1, rel=0.02)
+
+
 def test_no_target_step_is_spent_on_tracing() -> None:
     made = learned()
     assert made.num_timesteps == 100

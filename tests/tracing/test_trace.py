@@ -15,10 +15,11 @@ import pytest
 from simulated import PENDULUM, RATE, WITH_WHEEL, briefly, compiled, recorded
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_rpto.effects.carry import load_corrected
-from sb3_rpto.effects.commands import ActuatorLag
+from sb3_rpto.effects import Effect
+from sb3_rpto.effects.carry import load_corrected, read_effects
+from sb3_rpto.effects.commands import ActuatorLag, CommandDelay
 from sb3_rpto.effects.forces import TorqueOffset
-from sb3_rpto.effects.friction import CoulombFriction
+from sb3_rpto.effects.friction import CoulombFriction, ViscousFriction
 from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.adequacy import Adequacy
@@ -404,3 +405,67 @@ def test_declared_numbers_of_which_the_data_tell_nothing_are_named() -> None:
 def test_data_that_were_not_read_are_refused_at_once() -> None:
     with pytest.raises(TypeError, match="data must be Measurements, not str"):
         trace(PENDULUM, "runs/*.csv")  # type: ignore[arg-type]
+
+
+# --- effects that are known beforehand --------------------------------------------------------------------------------
+
+
+@cache
+def late(level: float = 0.0) -> Measurements:
+    """Commands act 20 ms late, and there is dry friction of a level."""
+    effects = [CommandDelay("motor", delay=0.02), CoulombFriction("hinge", level=level)]
+    return recorded(effects, compiled(COARSE), 5, 2.1, rate=100)
+
+
+def with_known(data: Measurements, *known: Effect, declared: Sequence[str] = ("pole.mass",)) -> Report:
+    with mock.patch("sb3_rpto.tracing.windows.LONGEST", 0.01):
+        return trace(COARSE, data, declared, known=known, candidates=NATIVE, horizon=0.4, threads=1)
+
+
+def test_a_known_effect_is_fitted_and_what_else_is_missing_is_named(tmp_path: Path) -> None:
+    report = with_known(late(0.08), CommandDelay("motor", delay=0.03))
+    assert report.verdict == "explained"
+    assert [t.label for t in report.effects] == ["coulomb_friction(hinge)"]
+    assert report.effects[0].effect.values[0] == pytest.approx(0.08, rel=0.03)
+    assert [t.label for t in report.declared] == ["pole.mass", "command_delay(motor)"]
+    assert report.declared[1].effect.values[0] == pytest.approx(0.02, abs=1e-3)
+    assert "command_delay(motor)" not in {c.label for c in report.candidates}
+    assert "known effects, fitted" in str(report)
+    report.save(tmp_path)
+    for again in (load_corrected(tmp_path).effects, read_effects(tmp_path / "effects.json", compiled(COARSE))):
+        assert [e.label for e in again] == ["pole.mass", "command_delay(motor)", "coulomb_friction(hinge)"]
+
+
+def test_with_all_effects_known_a_model_is_complete() -> None:
+    report = with_known(late(0.08), CommandDelay("motor", delay=0.02), CoulombFriction("hinge", level=0.05))
+    assert report.verdict == "complete"
+    assert report.declared[2].effect.values[0] == pytest.approx(0.08, rel=0.03)
+
+
+def test_a_known_effect_that_is_not_there_ends_at_its_null() -> None:
+    report = with_known(few(5), CommandDelay("motor", delay=0.03), CoulombFriction("hinge", level=0.05))
+    assert report.verdict == "complete"
+    assert report.declared[1].effect.values[0] == pytest.approx(0.0, abs=5e-4)
+
+
+def test_a_correction_is_gone_on_from() -> None:
+    first = with_known(late(), CommandDelay("motor", delay=0.03))
+    then = with_known(late(0.08), *first.correction, declared=())
+    assert [t.label for t in then.declared] == [t.label for t in first.declared]
+    assert [t.label for t in then.effects] == ["coulomb_friction(hinge)"]
+
+
+@pytest.mark.parametrize(
+    ("known", "said"),
+    [
+        (CommandDelay("motor", delay=0.02), r"must be a list of effects; write \[command_delay\(motor\)\]"),
+        (["command_delay"], "known must hold effects such as"),
+        ([CommandDelay("moter", delay=0.02)], r"no registered effect is 'command_delay\(moter\)'.*mean.*\(motor\)"),
+        ([ViscousFriction("hinge", coefficient=0.1)], "is a number that is declared, too"),
+        ([CommandDelay("motor")], "does nothing"),
+        ([CommandDelay("motor", delay=0.02), CommandDelay("motor", delay=0.03)], "is there twice"),
+    ],
+)
+def test_known_effects_that_cannot_be_are_refused_before_the_work(known: Any, said: str) -> None:
+    with pytest.raises((TypeError, ValueError), match=said):
+        trace(COARSE, simple(), ["hinge.damping"], known=known)

@@ -168,7 +168,7 @@ def true_structure(report: Report, data: Measurements, effects: Sequence[Effect]
     windows = cut(simulation.model, fitted, report.sigma, report.horizon, WINDOWS)
     scales = typical(simulation, force_residuals(simulation, simulation.null, fitted)).scales(simulation.effects)
     problem = Problem(simulation, windows, scales)
-    values, free = report.values_before.copy(), problem.declared.copy()
+    values, free = report.values_before.copy(), problem.known.copy()
     for effect in effects:
         place = simulation.slices[labels.index(effect.label)]
         values[place], free[place] = effect.values, True
