@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
@@ -64,13 +65,15 @@ class LoopCloser:
         self._error = math.inf
         #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
         self.stale = False
+        #: of the policy in the simulator as it is fitted
+        self.rehearsals = Rehearsals()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "reports": []}
 
     def forget_target(self) -> None:
         """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""
-        self._traced_at, self._error = None, math.inf
+        self._traced_at, self._error, self.rehearsals = None, math.inf, Rehearsals()
 
     def due(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
         """Whether enough was seen for a first trace, for a better one than the last, or is no longer predicted."""
@@ -125,8 +128,21 @@ class LoopCloser:
         if self.stale:
             renew_source(model)
             if not model._offline:
-                learn_in_source(model)
+                learn_in_source(model, lambda: self.rehearse(model))
+                self.rehearsals.go_back(model, lost=0.0)
             self.stale = False
+
+    def rehearse(self, model: TransferAlgorithm) -> None:
+        """Let the policy play in the simulator, where that accounts for the target."""
+        if model.updates_policy and self.found and self.found[-1]["verdict"] in SETTLED:
+            assert isinstance(model.dynamics, PhysicalDynamics)  # what was traced
+            self.rehearsals.rehearse(model, model.dynamics)
+
+    def watch(self, model: TransferAlgorithm) -> None:
+        """Where much was learned since the last rehearsal, rehearse, and go back to the best policy if it got worse."""
+        if self.rehearsals.due(model):
+            self.rehearse(model)
+            self.rehearsals.go_back(model)
 
     def _trace(
         self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements, horizon: float | None
@@ -281,8 +297,12 @@ def renew_source(model: TransferAlgorithm) -> None:
     model.source_timesteps += model._source_world.interact(model, FILL)
 
 
-def learn_in_source(model: TransferAlgorithm) -> None:
-    """Learn in the present simulator by rounds while its episodes earn more; the target waits meanwhile."""
+def learn_in_source(model: TransferAlgorithm, rehearse: Callable[[], None] = lambda: None) -> None:
+    """Learn in the present simulator by rounds while its episodes earn more; the target waits meanwhile.
+
+    :param rehearse: called before the first round and after each
+    """
+    rehearse()
     source = model._source_world
     assert isinstance(source, EpisodeSource)
     updates_per_step = max(model.gradient_steps, 1) / int(model.source_steps)
@@ -301,5 +321,6 @@ def learn_in_source(model: TransferAlgorithm) -> None:
         earned = float(np.mean(source.returns)) if source.returns else math.inf
         if model.verbose:
             print(f"learning in the corrected simulator: {steps} source steps, mean return {earned:.5g}")
+        rehearse()
         idle = 0 if earned > best else idle + 1
         best = max(best, earned) if source.returns else best

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.logger import Logger
@@ -133,7 +133,7 @@ class SLBO(MBPO):
         state = {key: value.detach().cpu().clone() for key, value in self.trpo.policy.state_dict().items()}
         self.snapshots[name]["trpo"] = state
 
-    def rollback(self, to: Literal["best", "source"] = "best") -> None:
+    def rollback(self, to: str = "best") -> None:
         """Go back to an earlier policy, TRPO's included."""
         super().rollback(to)
         self.trpo.policy.load_state_dict(self.snapshots[to]["trpo"])

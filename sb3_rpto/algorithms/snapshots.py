@@ -12,7 +12,7 @@ from sb3_rpto.algorithms.update import RelativeUpdate
 class PolicySnapshots(RelativeUpdate):
     """Keeps the policy that came from the source and the best one seen in the target."""
 
-    #: by name: "source" (as it came) and "best" (highest return in the target)
+    #: by name: "source" (as it came), "best" (highest return in the target), "simulator" (in the fitted simulator)
     snapshots: dict[str, dict[str, Any]]
     best_mean_reward: float
     #: what ``best_mean_reward`` is: the mean of recent training episodes, or an evaluation (``callbacks.KeepBest``)
@@ -35,10 +35,11 @@ class PolicySnapshots(RelativeUpdate):
         self.best_mean_reward = -np.inf
         self.snapshots.pop("best", None)
 
-    def rollback(self, to: Literal["best", "source"] = "best") -> None:
-        """Go back to the best policy seen in the target, or to the one that came from the source.
+    def rollback(self, to: str = "best") -> None:
+        """Go back to a policy that was kept.
 
-        :param to: "best" or "source"; restores actor, critics and temperature
+        :param to: "best" (in the target), "source" (as it came) or, with the loop closed, "simulator" (the best in the
+            fitted one); restores actor, critics and temperature
         :raises ValueError: when there is no such policy yet
         """
         if to not in self.snapshots:

@@ -167,7 +167,7 @@ class SimulatorSource(EpisodeSource):
     def __init__(self, dynamics: PhysicalDynamics, env: VecEnv, num_envs: int) -> None:
         dynamics.attach(env)
         self.dynamics = dynamics
-        self.copies = [StandingEnv(_copied(env), dynamics.effects()) for _ in range(num_envs)]
+        self.copies = [StandingEnv(copied(env), dynamics.effects()) for _ in range(num_envs)]
         makers: list[Callable[[], gym.Env]] = [lambda copy=copy: copy for copy in self.copies]  # type: ignore[misc]
         stacked = DummyVecEnv(makers)
         # Copies of one environment would draw the same numbers.
@@ -212,7 +212,11 @@ class SimulatorSource(EpisodeSource):
             super().set_state(state)
 
 
-def _copied(env: VecEnv) -> gym.Env:
+def copied(env: VecEnv) -> gym.Env:
+    """A copy of the first environment.
+
+    :raises ValueError: it cannot be copied
+    """
     copy = copy_env(env)
     if copy is None:
         raise ValueError(

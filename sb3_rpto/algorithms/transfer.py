@@ -433,6 +433,10 @@ class TransferAlgorithm(Resumable):
             if self.loop.due(self, self.dynamics):
                 self.loop.close(self, self.dynamics)
 
+    def _rehearse(self) -> None:
+        if self.loop is not None:
+            self.loop.watch(self)
+
     def dump_logs(self) -> None:
         """SB3's log plus what the source spent and earned."""
         self.logger.record("time/source_timesteps", self.source_timesteps, exclude="tensorboard")

@@ -133,6 +133,7 @@ class RelativeUpdate(SAC):
         self._since_fit = 0
         if not self._traces_log:
             self._fit_to_transitions()
+        self._rehearse()
         if self._offline:  # SB3 writes its logs at the end of target episodes; there are none
             self.dump_logs()
 
@@ -174,6 +175,9 @@ class RelativeUpdate(SAC):
 
     def _close_the_loop(self) -> None:
         """After a fit: trace what the simulator lacks, where that was asked for and is due."""
+
+    def _rehearse(self) -> None:
+        """After a fit: go back to a better policy, where a closed loop has one."""
 
     def _doubt_the_target(self, error: float) -> None:
         """After a fit that left this one-step error: say once what speaks against the target."""

@@ -165,7 +165,8 @@ class PhysicalDynamics(Dynamics):
         self._lower, self._upper = (np.array([getattr(p, b) for p in parameters]) for b in ("lower", "upper"))
         values = self.simulation.values()
         sizes = np.array([p.size_for(scales) for p in parameters])
-        self._scale = np.maximum(np.abs(self.simulation.null), sizes)
+        #: what is much of each parameter: its nominal value or what is plausible, (p,)
+        self.scale = np.maximum(np.abs(self.simulation.null), sizes)
         device = self._values.device if "_values" in self._buffers else None
         self.register_buffer("_values", th.as_tensor(values, dtype=th.float64, device=device))
         told = [(deviations or {}).get(e.label, np.zeros(len(e.parameters))) for e in self.simulation.effects]
@@ -341,13 +342,13 @@ class PhysicalDynamics(Dynamics):
         if not steps.compared.any() or not len(self.names):
             return {"steps": 0.0, "left_out": left_out}
         values, taken = self.values.copy(), 0
-        problem = OneStep(self.simulation, self._scale, self._lower, self._upper, steps, weights)
+        problem = OneStep(self.simulation, self.scale, self._lower, self._upper, steps, weights)
         problem.hold_what_is_not_determined(values)
         for _ in range(self.max_steps if max_steps is None else max_steps):
             moved = problem.step(values, self.max_step)
             if moved is None:
                 break
-            change = float(np.max(np.abs(moved - values) / self._scale))
+            change = float(np.max(np.abs(moved - values) / self.scale))
             values, taken = moved, taken + 1
             if change < STILL:
                 break

@@ -104,7 +104,7 @@ def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPat
 
 def test_an_empty_list_traces_the_declared_numbers_alone(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     began = []
-    monkeypatch.setattr(closing, "learn_in_source", lambda made: began.append(made.num_timesteps))
+    monkeypatch.setattr(closing, "learn_in_source", lambda made, *_: began.append(made.num_timesteps))
     made = model(friction(), close_loop=[])
     with pytest.warns(UserWarning, match="unexplained"):
         made.learn(90, source_timesteps=100)
@@ -225,11 +225,16 @@ def test_what_other_declared_numbers_produced_is_dropped_too(soon: None) -> None
     assert outdated(made, dynamics(made))
     assert made.loop is not None
     steps = made.source_timesteps
+
+    def learned_from() -> int:
+        assert made.loop is not None
+        return made.source_timesteps - steps - made.loop.rehearsals.steps
+
     made.loop.close(made, dynamics(made))
-    assert made.source_timesteps - steps == made.replay_buffer.source.size() >= 50
+    assert learned_from() == made.replay_buffer.source.size() >= 50
     assert not outdated(made, dynamics(made))
     made.loop.close(made, dynamics(made))  # the source stays as it is where the simulator does
-    assert made.source_timesteps - steps == made.replay_buffer.source.size()
+    assert learned_from() == made.replay_buffer.source.size()
 
 
 def test_an_unstable_correction_is_refused(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -372,7 +377,7 @@ def test_a_budget_of_source_steps_is_not_exceeded_by_the_loop(soon: None, monkey
     made = model([], target_data=recorded)
     assert made.loop is not None
     monkeypatch.setattr(made.loop, "_trace", lambda *_: explanation(friction()))
-    monkeypatch.setattr(closing, "learn_in_source", lambda _: pytest.fail("learns beyond the budget"))
+    monkeypatch.setattr(closing, "learn_in_source", lambda *_: pytest.fail("learns beyond the budget"))
     made.learn(200, source_timesteps=0)
     assert "coulomb_friction(slider).level" in dynamics(made).names
 
@@ -476,3 +481,104 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
     assert updates == [30] * rounds
     assert len(noises) == rounds
     assert made.source_timesteps == 5 + 20 * rounds
+
+
+# --- rehearsals -------------------------------------------------------------------------------------------------------
+
+
+def forgetful() -> RPTO:
+    """A model in a simulator that accounts for the target."""
+    made = filled([], 20)
+    assert made.loop is not None
+    made.loop.found.append({"verdict": "complete"})
+    made.take_snapshot("source")
+    return made
+
+
+def scripted(made: RPTO, monkeypatch: pytest.MonkeyPatch, *earns: float) -> None:
+    """Let rehearsals earn what is written."""
+    assert made.loop is not None
+    found = iter(earns)
+    monkeypatch.setattr(made.loop.rehearsals, "_earned", lambda *_: next(found))
+    monkeypatch.setattr(made.loop.rehearsals, "due", lambda _: True)
+
+
+def weights(made: RPTO) -> np.ndarray:
+    return th.cat([p.detach().flatten() for p in made.actor.parameters()]).numpy()
+
+
+def spoil(made: RPTO) -> None:
+    with th.no_grad():
+        for parameter in made.actor.parameters():
+            parameter += 0.1
+
+
+@pytest.mark.parametrize(("earned", "kept"), [(94.0, False), (96.0, True), (120.0, True)])
+def test_a_policy_that_clearly_got_worse_is_given_up(
+    earned: float, kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = forgetful()
+    scripted(made, monkeypatch, 50.0, 100.0, earned)
+    assert made.loop is not None
+    made.loop.watch(made)  # that of the source earned 50
+    best = weights(made)
+    spoil(made)
+    changed = weights(made)
+    made.loop.watch(made)
+    np.testing.assert_array_equal(weights(made), changed if kept else best)
+    made.rollback("simulator")
+    np.testing.assert_array_equal(weights(made), changed if earned > 100 else best)
+
+
+def test_the_first_policy_to_be_beaten_is_that_of_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = forgetful()
+    came = weights(made)
+    spoil(made)
+    scripted(made, monkeypatch, 50.0, 30.0)
+    assert made.loop is not None
+    made.loop.watch(made)
+    np.testing.assert_array_equal(weights(made), came)
+
+
+def test_what_was_earned_in_another_simulator_is_earned_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = forgetful()
+    scripted(made, monkeypatch, 50.0, 100.0, 40.0, 45.0)
+    assert made.loop is not None
+    made.loop.watch(made)
+    dynamics(made).fit(made.transitions("target"), max_steps=30)  # the target's pole is longer
+    made.loop.watch(made)
+    assert (made.loop.rehearsals.best, made.loop.rehearsals.last) == (45.0, 45.0)
+
+
+def test_a_simulator_that_does_not_account_for_the_target_judges_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = forgetful()
+    assert made.loop is not None
+    made.loop.found.append({"verdict": "unexplained"})
+    scripted(made, monkeypatch)
+    made.loop.watch(made)
+    assert made.loop.rehearsals.best == -np.inf
+
+
+def test_a_rehearsal_plays_the_deterministic_policy_in_the_fitted_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = forgetful()
+    data = made.transitions("target")
+    for _ in range(5):
+        dynamics(made).fit(data, max_steps=30)
+    assert made.loop is not None
+    rehearsals, before = made.loop.rehearsals, made.source_timesteps
+    monkeypatch.setattr("sb3_rpto.algorithms.rehearsals.EPISODES", 3)
+    rehearsals.rehearse(made, dynamics(made))
+    returns, steps = [], 0
+    env = target([])
+    for i in range(3):
+        observation, _ = env.reset(seed=30_000 + i)
+        over = False
+        earned = 0.0
+        while not over:
+            observation, reward, terminated, truncated, _ = env.step(made.predict(observation, deterministic=True)[0])
+            over, earned, steps = terminated or truncated, earned + float(reward), steps + 1
+        returns.append(earned)
+    assert rehearsals.last == pytest.approx(np.mean(returns), rel=1e-3)
+    # That of the source, the same one here, played too.
+    assert made.source_timesteps - before == rehearsals.steps == 2 * steps
+    assert not rehearsals.due(made)

@@ -1,0 +1,106 @@
+"""Never worse in the simulator, either: the best policy by whole episodes there, which cost no target step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sb3_rpto.algorithms.source import copied
+from sb3_rpto.dynamics.physical import PhysicalDynamics
+from sb3_rpto.envs.stance import StandingEnv
+
+if TYPE_CHECKING:
+    from sb3_rpto.algorithms.transfer import TransferAlgorithm
+
+#: Episodes of a rehearsal, always from the same starts, and their most steps where the task has no end.
+EPISODES, LONGEST, SEED = 10, 1_000, 30_000
+#: Updates of the policy between two rehearsals.
+EVERY = 2_000
+#: A policy that earns less than the best by more than this share is given up for it: one fall in ten episodes does.
+LOST = 0.05
+#: What was earned counts no longer when a number of the simulator has moved by this share of its scale.
+MOVED = 1e-3
+
+
+class Rehearsals:
+    """Lets the deterministic policy play in the fitted simulator, and goes back to the best one where it got worse.
+
+    Warm-started SAC that learns on from what a good policy sees forgets what it does not see any more. The simulator
+    tells for nothing; the first policy to be beaten is the one that came from the source. The best is
+    ``snapshots["simulator"]``.
+    """
+
+    def __init__(self) -> None:
+        #: mean returns of the best policy and of the last one
+        self.best = self.last = -np.inf
+        #: taken so far, of the source's
+        self.steps = 0
+        self._phi: np.ndarray | None = None
+        self._names: list[str] = []
+        self._at_update = 0
+
+    def due(self, model: TransferAlgorithm) -> bool:
+        """Whether the policy has learned enough since the last one."""
+        return model._n_updates - self._at_update >= EVERY
+
+    def rehearse(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:
+        """Play, and keep the policy if it is the best so far."""
+        self._at_update = model._n_updates
+        if self._has_moved(dynamics):
+            self._rehearse_best(model, dynamics)
+        self.last = self._earned(model, dynamics)
+        model.logger.record("source/rehearsed", self.last)
+        if self.last >= self.best:
+            self.best = self.last
+            model.take_snapshot("simulator")
+
+    def go_back(self, model: TransferAlgorithm, lost: float = LOST) -> None:
+        """Take up the best policy again if the one that was rehearsed last earned clearly less.
+
+        :param lost: by more than this share of the best return
+        """
+        if self.last < self.best - lost * abs(self.best):
+            model.rollback("simulator")
+            if model.verbose:
+                print(f"back to a policy that earns {self.best:.5g} in the simulator; the last one: {self.last:.5g}")
+            self.last = self.best
+
+    def _rehearse_best(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:
+        """The best policy so far, in the simulator as it is now; in the beginning, the one from the source."""
+        model.snapshots.setdefault("simulator", model.snapshots["source"])
+        model.take_snapshot("present")
+        try:
+            model.rollback("simulator")
+            self.best = self._earned(model, dynamics)
+        finally:
+            model.rollback("present")
+            del model.snapshots["present"]
+        self._phi, self._names = dynamics.values.copy(), list(dynamics.names)
+
+    def _has_moved(self, dynamics: PhysicalDynamics) -> bool:
+        if self._phi is None or self._names != dynamics.names:
+            return True
+        return bool((np.abs(dynamics.values - self._phi) > MOVED * dynamics.scale).any())
+
+    def _earned(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> float:
+        """Mean return of the deterministic policy in copies of the simulator; its steps are counted."""
+        assert model.env is not None
+        copies = [StandingEnv(copied(model.env), dynamics.effects()) for _ in range(EPISODES)]
+        seen = np.array([copy.reset(seed=SEED + i)[0] for i, copy in enumerate(copies)])
+        returns, running, steps = np.zeros(EPISODES), np.ones(EPISODES, dtype=bool), 0
+        normaliser = model.get_vec_normalize_env()
+        for _ in range(LONGEST):
+            actions, _ = model.predict(
+                seen if normaliser is None else normaliser.normalize_obs(seen), deterministic=True
+            )
+            for i in np.flatnonzero(running):
+                seen[i], reward, terminated, truncated, _ = copies[i].step(actions[i])
+                returns[i] += float(reward)
+                running[i] = not (terminated or truncated)
+                steps += 1
+            if not running.any():
+                break
+        self.steps += steps
+        model.source_timesteps += steps
+        return float(returns.mean())
