@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from sb3_rpto.algorithms.transfer import TransferAlgorithm
 
 #: Episodes of a rehearsal, always from the same starts, and their most steps where the task has no end.
-EPISODES, LONGEST, SEED = 10, 1_000, 30_000
+EPISODES, LONGEST, SEED = 25, 1_000, 30_000
 #: Updates of the policy between two rehearsals.
-EVERY = 2_000
-#: A policy that earns less than the best by more than this share is given up for it: one fall in ten episodes does.
-LOST = 0.05
+EVERY = 4_000
+#: A policy that earns less than the best by more than this share is given up for it: one fall in all of them does.
+LOST = 0.03
 #: What was earned counts no longer when a number of the simulator has moved by this share of its scale.
 MOVED = 1e-3
 
@@ -38,7 +38,7 @@ class Rehearsals:
         self.steps = 0
         self._phi: np.ndarray | None = None
         self._names: list[str] = []
-        self._at_update = 0
+        self._at_update = -np.inf  # the first one as soon as the simulator accounts for the target
 
     def due(self, model: TransferAlgorithm) -> bool:
         """Whether the policy has learned enough since the last one."""
