@@ -29,8 +29,8 @@ class HorizonError:
     :param horizon: in s, or ``"whole run"``
     :param joints: names of the columns
     :param rmse: root mean squared error of each, rad or m, (m,)
-    :param low: 2.5 % quantile over resampled blocks, (m,)
-    :param high: 97.5 % quantile, (m,)
+    :param low: 2.5 % quantile over resampled blocks, (m,); of whole runs the smallest; NaN where there is but one
+    :param high: 97.5 % quantile, (m,); of whole runs the largest
     :param mae: mean absolute error, (m,)
     :param windows: number of predictions
     """
@@ -82,9 +82,14 @@ def _pool(
     for _ in range(RESAMPLES):
         rows = np.concatenate([blocks[i] for i in rng.integers(len(blocks), size=len(blocks))])
         resampled.append(np.sqrt(squares[rows].sum(0) / counts[rows].sum(0)))
-    low, high = np.quantile(resampled, [0.025, 0.975], axis=0)
+    low, high = _bounds(np.quantile(resampled, [0.025, 0.975], axis=0), len(blocks))
     rmse, mae = np.sqrt(squares.sum(0) / counts.sum(0)), absolute.sum(0) / counts.sum(0)
     return HorizonError(horizon, joints, rmse, low, high, mae, len(windows))
+
+
+def _bounds(interval: np.ndarray, count: int) -> np.ndarray:
+    """An interval (2, m) over so many blocks or runs: one of them tells nothing of the others."""
+    return interval if count > 1 else np.full_like(interval, np.nan)
 
 
 def predictions(
@@ -122,12 +127,13 @@ def whole_runs(
     rmses = np.array([np.sqrt(np.mean(d**2, axis=0)) for d in differences])
     pooled = np.concatenate(differences)
     # Runs are few: their own range stands for the interval.
+    low, high = _bounds(np.stack([rmses.min(0), rmses.max(0)]), len(rmses))
     return HorizonError(
         "whole run",
         _observed(data),
         np.sqrt(np.mean(pooled**2, axis=0)),
-        rmses.min(0),
-        rmses.max(0),
+        low,
+        high,
         np.mean(np.abs(pooled), axis=0),
         len(differences),
     )

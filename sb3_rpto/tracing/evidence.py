@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t as student
 
 from sb3_rpto.tracing.windows import Windows
 
@@ -12,6 +13,8 @@ from sb3_rpto.tracing.windows import Windows
 GAIN = 0.03
 #: Errors below this many units of noise are none: exact data are met to rounding, where any ratio may be large.
 NOTHING = 0.5
+#: The t of fewer blocks counts as what is as unlikely among so many: two or three may agree by chance.
+BLOCKS = 10
 #: Most folds of a cross-validation.
 FOLDS = 6
 
@@ -21,7 +24,8 @@ class Evidence:
     """What a model gains over another on the select windows.
 
     :param gain: share of the typical window error saved, 1 - exp(-mean log ratio)
-    :param t: mean log error ratio of the blocks over its standard error
+    :param t: mean log error ratio of the blocks over its standard error; among less than :data:`BLOCKS` that which has
+        the same level of significance among so many
     :param blocks: the log ratio of each block, (b,)
     """
 
@@ -58,7 +62,15 @@ def _evidence(blocks: np.ndarray) -> Evidence:
     error = float(blocks.std(ddof=1)) / np.sqrt(len(blocks))
     # Few blocks may agree by chance: their spread counts as at least a percent.
     error = max(error, 0.01 / np.sqrt(len(blocks)))
-    return Evidence(1 - float(np.exp(-mean)), mean / error, blocks)
+    return Evidence(1 - float(np.exp(-mean)), _among_many(mean / error, len(blocks)), blocks)
+
+
+def _among_many(t: float, count: int) -> float:
+    """The t that is as unlikely by chance among :data:`BLOCKS` blocks as this is among fewer."""
+    if count >= BLOCKS:
+        return t
+    # By the upper tail, which keeps its digits where 1 - p has none left.
+    return float(np.copysign(student.isf(student.sf(abs(t), count - 1), BLOCKS - 1), t))
 
 
 def folds(windows: Windows, horizon: float, count: int = FOLDS) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -88,7 +88,9 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def interval(low: float, high: float, digits: int = 4) -> str:
-    """``[low, high]``."""
+    """``[low, high]``; a dash where neither is known."""
+    if not (np.isfinite(low) or np.isfinite(high)):
+        return number(np.nan)
     return f"[{number(low, digits)}, {number(high, digits)}]"
 
 

@@ -155,3 +155,15 @@ def test_whole_runs_are_predicted_to_their_end() -> None:
     _, difference, _ = predictions(simulation, np.zeros(1), windows)
     assert found.rmse[0] == pytest.approx(np.sqrt(np.mean(difference**2)), rel=0.05)
     assert pytest.approx(windows.measured.shape[1]) == RATE * 2.9
+
+
+def test_a_single_block_or_run_gives_no_interval() -> None:
+    data = recorded(duration=2.5)
+    one = replace(data, episodes=data.episodes[:1])
+    simulation = Simulation(compiled(), [], 1)
+    found = {e.horizon: e for e in horizon_errors(simulation, simulation.null, one, SIGMA, 0)}
+    assert np.isfinite(found[0.5].low).all()  # of several blocks
+    assert np.isnan([found["whole run"].low, found["whole run"].high]).all()
+    short = horizon_errors(simulation, simulation.null, recorded(duration=0.9, episodes=1), SIGMA, 0)[0]
+    assert np.isnan([short.low, short.high]).all()
+    assert np.isfinite(short.rmse).all()
