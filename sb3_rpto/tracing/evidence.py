@@ -14,7 +14,7 @@ GAIN = 0.03
 #: Errors below this many units of noise are none: exact data are met to rounding, where any ratio may be large.
 NOTHING = 0.5
 #: The t of fewer blocks counts as what is as unlikely among so many: two or three may agree by chance.
-BLOCKS = 10
+BLOCKS = 6
 #: Most folds of a cross-validation.
 FOLDS = 6
 
