@@ -18,7 +18,9 @@ from sb3_rpto.algorithms.bookkeeping import TwoWorlds
 from sb3_rpto.algorithms.worlds import members
 from sb3_rpto.dynamics.factory import BACKENDS, is_mujoco
 from sb3_rpto.dynamics.weights import WEIGHTINGS
-from sb3_rpto.effects import LIBRARY
+from sb3_rpto.effects import LIBRARY, from_json
+from sb3_rpto.effects.library import given
+from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.names import near
 
 #: Arguments that only an algorithm with trainable dynamics has a use for.
@@ -168,6 +170,10 @@ def check_something_to_fit(
         raise ValueError(
             "rollout_start is for one-step branches; dynamics='physical' simulates whole episodes: leave it out"
         )
+    if mujoco and (close_loop is not False or traces_log):  # a trace would refuse them after many target steps
+        model = config["model"]
+        compiled = model.compile() if isinstance(model, PlainModel) else model
+        given(compiled, config.get("declared", ()), [from_json(stored) for stored in config.get("effects", ())])
     if mujoco and not close_loop and not config.get("declared") and not config.get("effects"):
         raise ValueError(
             "dynamics='physical' has nothing to fit: pass declared=[...], names of the model's numbers such as "

@@ -65,6 +65,8 @@ class LoopCloser:
         self._error = math.inf
         #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
         self.stale = False
+        #: whether the last trace accounts for the target, so that the simulator may judge policies
+        self.accounts = False
         #: of the policy in the simulator as it is fitted
         self.rehearsals = Rehearsals()
 
@@ -73,7 +75,7 @@ class LoopCloser:
 
     def forget_target(self) -> None:
         """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""
-        self._traced_at, self._error, self.rehearsals = None, math.inf, Rehearsals()
+        self._traced_at, self._error, self.accounts, self.rehearsals = None, math.inf, False, Rehearsals()
 
     def due(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
         """Whether enough was seen for a first trace, for a better one than the last, or is no longer predicted."""
@@ -129,20 +131,26 @@ class LoopCloser:
             renew_source(model)
             if not model._offline:
                 learn_in_source(model, lambda: self.rehearse(model))
-                self.rehearsals.go_back(model, lost=0.0)
+                if self.rehearsed_by(model):
+                    self.rehearsals.go_back(model)
             self.stale = False
 
+    def rehearsed_by(self, model: TransferAlgorithm) -> bool:
+        """Whether the policy is to be rehearsed: it learns, and the simulator accounts for the target."""
+        return model.updates_policy and self.accounts
+
     def rehearse(self, model: TransferAlgorithm) -> None:
-        """Let the policy play in the simulator, where that accounts for the target."""
-        if model.updates_policy and self.found and self.found[-1]["verdict"] in SETTLED:
+        """Let the policy play in the simulator, where that may judge it."""
+        if self.rehearsed_by(model):
             assert isinstance(model.dynamics, PhysicalDynamics)  # what was traced
             self.rehearsals.rehearse(model, model.dynamics)
 
     def watch(self, model: TransferAlgorithm) -> None:
         """Where much was learned since the last rehearsal, rehearse, and go back to the best policy if it got worse."""
-        if self.rehearsals.due(model):
+        if self.rehearsed_by(model) and self.rehearsals.due(model):
             self.rehearse(model)
-            self.rehearsals.go_back(model)
+            if self.rehearsals.clearly_worse():
+                self.rehearsals.go_back(model)
 
     def _trace(
         self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements, horizon: float | None
@@ -160,6 +168,7 @@ class LoopCloser:
         )
         self.reports.append(report)
         self.found.append(report.to_json())
+        self.accounts = report.verdict in SETTLED
         return report
 
     def _take(

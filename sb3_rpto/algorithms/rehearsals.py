@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sb3_rpto.algorithms.source import copied
+from sb3_rpto.algorithms.worlds import check_finite
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.envs.stance import StandingEnv
 
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
 EPISODES, LONGEST, SEED = 25, 1_000, 30_000
 #: Updates of the policy between two rehearsals.
 EVERY = 4_000
-#: A policy that earns less than the best by more than this share is given up for it: one fall in all of them does.
+#: A policy that earns less than the best by more than this share, and by more than the standard error of what the best
+#: earned, is given up for it: an early fall in one of all episodes is enough.
 LOST = 0.03
 #: What was earned counts no longer when a number of the simulator has moved by this share of its scale.
 MOVED = 1e-3
@@ -34,6 +36,7 @@ class Rehearsals:
     def __init__(self) -> None:
         #: mean returns of the best policy and of the last one
         self.best = self.last = -np.inf
+        self._error = 0.0  # standard error of the best one's
         #: taken so far, of the source's
         self.steps = 0
         self._phi: np.ndarray | None = None
@@ -49,18 +52,20 @@ class Rehearsals:
         self._at_update = model._n_updates
         if self._has_moved(dynamics):
             self._rehearse_best(model, dynamics)
-        self.last = self._earned(model, dynamics)
+        returns = self._play(model, dynamics)
+        self.last = float(returns.mean())
         model.logger.record("source/rehearsed", self.last)
         if self.last >= self.best:
-            self.best = self.last
+            self._is_best(returns)
             model.take_snapshot("simulator")
 
-    def go_back(self, model: TransferAlgorithm, lost: float = LOST) -> None:
-        """Take up the best policy again if the one that was rehearsed last earned clearly less.
+    def clearly_worse(self) -> bool:
+        """Whether the last policy earned much less than the best one, and more so than episodes differ."""
+        return self.last < self.best - LOST * abs(self.best) - self._error
 
-        :param lost: by more than this share of the best return
-        """
-        if self.last < self.best - lost * abs(self.best):
+    def go_back(self, model: TransferAlgorithm) -> None:
+        """Take up the best policy again, unless the last one is."""
+        if self.last < self.best:
             model.rollback("simulator")
             if model.verbose:
                 print(f"back to a policy that earns {self.best:.5g} in the simulator; the last one: {self.last:.5g}")
@@ -72,19 +77,22 @@ class Rehearsals:
         model.take_snapshot("present")
         try:
             model.rollback("simulator")
-            self.best = self._earned(model, dynamics)
+            self._is_best(self._play(model, dynamics))
         finally:
             model.rollback("present")
             del model.snapshots["present"]
         self._phi, self._names = dynamics.values.copy(), list(dynamics.names)
+
+    def _is_best(self, returns: np.ndarray) -> None:
+        self.best, self._error = float(returns.mean()), float(returns.std() / np.sqrt(len(returns)))
 
     def _has_moved(self, dynamics: PhysicalDynamics) -> bool:
         if self._phi is None or self._names != dynamics.names:
             return True
         return bool((np.abs(dynamics.values - self._phi) > MOVED * dynamics.scale).any())
 
-    def _earned(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> float:
-        """Mean return of the deterministic policy in copies of the simulator; its steps are counted."""
+    def _play(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> np.ndarray:
+        """Returns of the deterministic policy in copies of the simulator, an episode each; its steps are counted."""
         assert model.env is not None
         copies = [StandingEnv(copied(model.env), dynamics.effects()) for _ in range(EPISODES)]
         seen = np.array([copy.reset(seed=SEED + i)[0] for i, copy in enumerate(copies)])
@@ -96,6 +104,7 @@ class Rehearsals:
             )
             for i in np.flatnonzero(running):
                 seen[i], reward, terminated, truncated, _ = copies[i].step(actions[i])
+                check_finite("source", observation=seen[i], reward=np.array(reward))
                 returns[i] += float(reward)
                 running[i] = not (terminated or truncated)
                 steps += 1
@@ -103,4 +112,4 @@ class Rehearsals:
                 break
         self.steps += steps
         model.source_timesteps += steps
-        return float(returns.mean())
+        return returns

@@ -31,15 +31,16 @@ class PolicySnapshots(RelativeUpdate):
         return True
 
     def forget_best(self) -> None:
-        """Begin anew to look for the best policy."""
+        """Begin anew to look for the best policy, in the target and in the simulator that is fitted to it."""
         self.best_mean_reward = -np.inf
         self.snapshots.pop("best", None)
+        self.snapshots.pop("simulator", None)
 
     def rollback(self, to: str = "best") -> None:
         """Go back to a policy that was kept.
 
-        :param to: "best" (in the target), "source" (as it came) or, with the loop closed, "simulator" (the best in the
-            fitted one); restores actor, critics and temperature
+        :param to: "best" (in the target), "source" (as it came) or, where a trace accounts for the target,
+            "simulator" (the best in the fitted one); restores actor, critics and temperature
         :raises ValueError: when there is no such policy yet
         """
         if to not in self.snapshots:

@@ -148,7 +148,7 @@ def begin_in_source(model: Resumable, source_timesteps: int, progress_bar: bool)
         buffer.resize_source(max(buffer.source.buffer_size, source_timesteps))
         _train_in_source(model, source_timesteps, progress_bar)
     model._warm = True
-    if not model.snapshots:
+    if "source" not in model.snapshots:
         model.take_snapshot("source")
     # A network must be fitted to describe the source; a physical model comes with the source's constants.
     learned = model.dynamics if model.dynamics is not None and model.dynamics.rollout == "branches" else None

@@ -46,8 +46,8 @@ def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
     if hidden:
         raise ValueError(
             f"{env_name(single)} has effects that are no numbers of its model ({', '.join(hidden)}), which phi would "
-            "lack; give the environment without them, and them as dynamics_kwargs={'effects': [...]} (with the loop "
-            "open; a closed one finds them by itself)"
+            "lack; give the environment without them, and them as dynamics_kwargs={'effects': [...]} (a closed "
+            "loop takes them for known)"
         )
     frame_skip = getattr(single.unwrapped, "frame_skip", None)
     if frame_skip is None:

@@ -68,7 +68,8 @@ def given(model: mujoco.MjModel, declared: Sequence[str], known: Sequence[Effect
             raise TypeError(
                 f"known must hold effects such as LIBRARY['command_delay']('motor', delay=0.02), not {effect!r}"
             )
-    names = [*declared, *(effect.label for effect in known if isinstance(effect, Declared))]
+    # Bounds are those of the last entry: what the user declared.
+    names = [*(effect.label for effect in known if isinstance(effect, Declared)), *declared]
     found: list[Effect] = [*declare(model, names)]
     everywhere, free = ({e.label for e in candidates(model, taken)} for taken in ((), names))
     for effect in [effect for effect in known if not isinstance(effect, Declared)]:

@@ -61,7 +61,7 @@ def origin(
         simulation = Simulation(stepped, there, threads)
         scales = typical(simulation, force_residuals(simulation, simulation.null, kind)).scales(there)
         problem = Problem(simulation, cut(stepped, kind, noise, horizon, WINDOWS), scales)
-        fit = problem.fit(simulation.null, np.arange(simulation.size), iterations=ITERATIONS)
+        fit = problem.fit(simulation.null, np.flatnonzero(simulation.strength), iterations=ITERATIONS)
         return float(np.median(fit.errors))
 
     continuous = error(data, sigma)

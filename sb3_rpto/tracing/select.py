@@ -120,11 +120,14 @@ class Selector:
         return self.select or self.train
 
     def free(self, effects: Sequence[int]) -> np.ndarray:
-        """Indices of the parameters of the declared and of the given effects."""
-        keep = [s for i, s in enumerate(self.simulation.slices) if i in effects or self.simulation.effects[i].known]
-        return (
-            np.concatenate([np.arange(s.start, s.stop) for s in keep]).astype(int) if keep else np.empty(0, dtype=int)
-        )
+        """Indices of the parameters of what is known and of the given effects.
+
+        Of effects that are known the shapes stay as they are: while something else is missing, fits bend them to that.
+        """
+        chosen = np.zeros(self.simulation.size, dtype=bool)
+        for i in effects:
+            chosen[self.simulation.slices[i]] = True
+        return np.flatnonzero(chosen | (self.train.known & self.simulation.strength))
 
     def together(self, effects: Sequence[int], base: Fit, begin: Fit) -> tuple[Model, Model | None]:
         """Fit all candidates at once; where that ends badly, again from the best few of their kinds.

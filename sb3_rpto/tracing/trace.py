@@ -12,6 +12,7 @@ from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.units import units_at
 from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE, Adequacy
 from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.concentrate import NOTHING
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
@@ -175,14 +176,18 @@ def _steady(progress: Progress | None) -> Progress:
 def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 200) -> tuple[np.ndarray, np.ndarray]:
     """Fit on train and select together; intervals by resampling blocks.
 
-    :return: all parameters (p,), and their 2.5 % and 97.5 % quantiles (2, p)
+    :return: all parameters (p,), and their 2.5 % and 97.5 % quantiles (2, p), NaN where nothing was fitted: what
+        shows in no window is what it was
     """
     joined = problem.windows
     free = Selector(problem, problem, 0.0, lambda share, what: None).free(selection.model.effects)
     fit = problem.fit(selection.model.fit.values, free, iterations=FINAL)
-    intervals = np.stack([fit.values, fit.values])
+    values, intervals = fit.values.copy(), np.full((2, len(fit.values)), np.nan)
     if len(free):
         linear = problem.linear(fit, free)
+        curvature = np.einsum("wff->f", linear.normal)
+        hidden = free[curvature <= NOTHING * curvature.max()]
+        values[hidden] = problem.null[hidden]
         ridge = 1e-9 * np.eye(len(free)) * max(1e-12, float(np.trace(linear.normal.sum(0))))
         blocks = [np.flatnonzero(joined.block == b) for b in np.unique(joined.block)]
         rng = np.random.default_rng(seed)
@@ -192,9 +197,10 @@ def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 20
             # The mean gradient is not quite zero at a bound; only its scatter matters.
             gradient = linear.gradient[rows].sum(0) - linear.gradient.sum(0) * len(rows) / len(joined)
             moves.append(-np.linalg.solve(linear.normal[rows].sum(0) + ridge, gradient) * problem.size[free])
-        intervals[:, free] += np.quantile(moves, [0.025, 0.975], axis=0)
+        intervals[:, free] = fit.values[free] + np.quantile(moves, [0.025, 0.975], axis=0)
         intervals = np.clip(intervals, problem.lower, problem.upper)
-    return fit.values, intervals
+        intervals[:, hidden] = np.nan
+    return values, intervals
 
 
 def join(a: Windows, b: Windows) -> Windows:
@@ -270,7 +276,7 @@ def _undetermined(problem: Problem, values: np.ndarray, intervals: np.ndarray) -
     for i in np.flatnonzero(problem.known & problem.simulation.strength):
         (effect, parameter), value, (low, high) = owners[i], float(values[i]), intervals[:, i]
         scale = max(abs(value), abs(float(problem.null[i])) or float(problem.size[i]))
-        if high - low > VAGUE * scale:
+        if not high - low <= VAGUE * scale:  # nor where there is no interval
             is_number = isinstance(effect, Declared)
             where = f"declared {effect.label}" if is_number else f"known {effect.label}, {parameter.name}"
             message = (

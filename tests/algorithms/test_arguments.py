@@ -157,6 +157,20 @@ def test_effects_that_are_known_are_trained(close_loop):
     assert made.dynamics.names == ["command_delay(slide).delay"]
 
 
+@pytest.mark.parametrize(
+    ("effects", "said"),
+    [
+        ([LIBRARY["command_delay"]("slide")], "does nothing"),
+        ([LIBRARY["viscous_friction"]("hinge", coefficient=0.1)], "is a number that is declared, too"),
+        ([LIBRARY["command_delay"]("slide", delay=d) for d in (0.02, 0.03)], "is there twice"),
+    ],
+)
+def test_known_effects_that_a_trace_would_refuse_are_refused_before_the_first_step(effects, said):
+    given = {"effects": [effect.to_json() for effect in effects]}
+    with pytest.raises(ValueError, match=said):
+        physical(close_loop=["spring"], declared=["hinge.damping"], dynamics_kwargs=given)
+
+
 @pytest.mark.parametrize("normalised", [0, 1])
 def test_statistics_of_one_world_alone_are_refused(normalised):
     worlds = [pendulum(), pendulum(12.0)]

@@ -492,7 +492,7 @@ def forgetful() -> RPTO:
     """A model in a simulator that accounts for the target."""
     made = filled([], 20)
     assert made.loop is not None
-    made.loop.found.append({"verdict": "complete"})
+    made.loop.accounts = True
     made.take_snapshot("source")
     return made
 
@@ -501,7 +501,7 @@ def scripted(made: RPTO, monkeypatch: pytest.MonkeyPatch, *earns: float) -> None
     """Let rehearsals earn what is written."""
     assert made.loop is not None
     found = iter(earns)
-    monkeypatch.setattr(made.loop.rehearsals, "_earned", lambda *_: next(found))
+    monkeypatch.setattr(made.loop.rehearsals, "_play", lambda *_: np.full(25, next(found)))
     monkeypatch.setattr(made.loop.rehearsals, "due", lambda _: True)
 
 
@@ -552,10 +552,59 @@ def test_what_was_earned_in_another_simulator_is_earned_anew(monkeypatch: pytest
     assert (made.loop.rehearsals.best, made.loop.rehearsals.last) == (45.0, 45.0)
 
 
+def test_a_loss_within_what_episodes_differ_by_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near a return of zero any change is a large share of it."""
+    made = forgetful()
+    assert made.loop is not None
+    spread = np.random.default_rng(0).normal(0.0, 0.5, 25)
+    played = iter([spread, spread + 0.02, spread, spread - 5.0])
+    monkeypatch.setattr(made.loop.rehearsals, "_play", lambda *_: next(played))
+    monkeypatch.setattr(made.loop.rehearsals, "due", lambda _: True)
+    made.loop.watch(made)
+    spoil(made)
+    changed = weights(made)
+    made.loop.watch(made)
+    np.testing.assert_array_equal(weights(made), changed)
+    made.loop.watch(made)
+    assert not np.array_equal(weights(made), changed)
+
+
+def test_what_an_earlier_simulator_said_undoes_nothing(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = forgetful()
+    scripted(made, monkeypatch, 50.0, 100.0, 98.0)
+    assert made.loop is not None
+    made.loop.watch(made)
+    made.loop.watch(made)  # worse, but not clearly
+    made.loop.accounts, made.loop.stale = False, True
+    made.loop.renew(made)  # learns in a simulator that may not judge
+    learned_there = weights(made)
+    made.rollback("simulator")
+    assert not np.array_equal(weights(made), learned_there)
+
+
+def test_another_target_is_not_judged_by_the_simulator_of_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = forgetful()
+    scripted(made, monkeypatch, 50.0, 100.0)
+    assert made.loop is not None
+    made.loop.watch(made)
+    with pytest.warns(UserWarning, match="D_target loses"):
+        made.set_target_env(target(friction()))
+    assert "simulator" not in made.snapshots
+    made.loop.watch(made)
+    assert made.loop.rehearsals.best == -np.inf
+
+
+def test_a_snapshot_of_ones_own_does_not_stand_for_that_of_the_source(soon: None) -> None:
+    made = model([])
+    made.take_snapshot("mine")
+    made.learn(1, source_timesteps=0)
+    assert {"mine", "source"} <= set(made.snapshots)
+
+
 def test_a_simulator_that_does_not_account_for_the_target_judges_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     made = forgetful()
     assert made.loop is not None
-    made.loop.found.append({"verdict": "unexplained"})
+    made.loop.accounts = False
     scripted(made, monkeypatch)
     made.loop.watch(made)
     assert made.loop.rehearsals.best == -np.inf

@@ -15,11 +15,12 @@ import pytest
 from simulated import PENDULUM, RATE, WITH_WHEEL, briefly, compiled, recorded
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_rpto.effects import Effect
+from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.effects.carry import load_corrected, read_effects
 from sb3_rpto.effects.commands import ActuatorLag, CommandDelay
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, ViscousFriction
+from sb3_rpto.effects.library import given
 from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.adequacy import Adequacy
@@ -469,3 +470,31 @@ def test_a_correction_is_gone_on_from() -> None:
 def test_known_effects_that_cannot_be_are_refused_before_the_work(known: Any, said: str) -> None:
     with pytest.raises((TypeError, ValueError), match=said):
         trace(COARSE, simple(), ["hinge.damping"], known=known)
+
+
+def test_the_shape_of_a_known_effect_does_not_bend_to_what_is_missing() -> None:
+    stribeck = LIBRARY["stribeck_friction"]
+    true = stribeck("hinge", level=0.05, extra=0.1, speed=0.4)
+    data = recorded([true, LIBRARY["spring"]("hinge", stiffness=0.3)], compiled(COARSE), 5, 2.1, rate=100)
+    report = with_known(data, stribeck("hinge", level=0.06, extra=0.08, speed=0.4))
+    assert report.verdict == "explained"
+    assert [t.label for t in report.effects] == ["spring(hinge)"]
+    known = report.declared[1]
+    np.testing.assert_allclose(known.effect.values, true.values, rtol=0.1)
+    shape = [p.shape for p in true.parameters]
+    assert known.effect.values[shape] == [0.4]
+    assert np.isnan(known.interval[:, shape]).all()
+
+
+def test_what_the_data_do_not_show_stays_as_it_is_given_and_is_named() -> None:
+    saturation = LIBRARY["command_saturation"]("motor", inverse_limit=0.3)  # far above all commands
+    report = with_known(simple(), saturation)
+    assert report.declared[1].effect.values[0] == 0.3
+    assert np.isnan(report.declared[1].interval).all()
+    assert "known command_saturation(motor), inverse_limit" in {f.where for f in report.findings}
+
+
+def test_bounds_that_are_declared_win_over_those_of_what_is_known() -> None:
+    model = compiled(COARSE)
+    (mass,) = given(model, ["pole.mass=0.3:0.9"], declare(model, ["pole.mass"]))
+    assert (mass.parameters[0].lower, mass.parameters[0].upper) == (0.3, 0.9)
