@@ -633,3 +633,23 @@ def test_a_rehearsal_plays_the_deterministic_policy_in_the_fitted_simulator(monk
     # That of the source, the same one here, played too.
     assert made.source_timesteps - before == rehearsals.steps == 2 * steps
     assert not rehearsals.due(made)
+
+
+def test_a_reward_that_is_no_number_is_said_in_a_rehearsal_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = forgetful()
+    assert made.loop is not None
+    monkeypatch.setattr(
+        "sb3_rpto.algorithms.rehearsals.StandingEnv.step",
+        lambda env, action: (env.observation_space.sample(), np.nan, True, False, {}),
+    )
+    with pytest.raises(ValueError, match=r"source.*reward"):
+        made.loop.watch(made)
+
+
+def test_a_policy_is_rehearsed_where_a_log_was_traced_and_no_step_of_the_budget_is_spent_on_it() -> None:
+    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
+    made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)
+    assert made.loop is not None
+    assert made.loop.found[-1]["verdict"] == "complete"
+    assert made.loop.rehearsals.steps > 0
+    assert made.num_timesteps == 60
