@@ -131,23 +131,23 @@ class LoopCloser:
             renew_source(model)
             if not model._offline:
                 learn_in_source(model, lambda: self.rehearse(model))
-                if self.rehearsed_by(model):
+                if self.may_judge(model):
                     self.rehearsals.go_back(model)
             self.stale = False
 
-    def rehearsed_by(self, model: TransferAlgorithm) -> bool:
-        """Whether the policy is to be rehearsed: it learns, and the simulator accounts for the target."""
+    def may_judge(self, model: TransferAlgorithm) -> bool:
+        """Whether rehearsals say anything: the policy learns, and the simulator accounts for the target."""
         return model.updates_policy and self.accounts
 
     def rehearse(self, model: TransferAlgorithm) -> None:
         """Let the policy play in the simulator, where that may judge it."""
-        if self.rehearsed_by(model):
+        if self.may_judge(model):
             assert isinstance(model.dynamics, PhysicalDynamics)  # what was traced
             self.rehearsals.rehearse(model, model.dynamics)
 
     def watch(self, model: TransferAlgorithm) -> None:
         """Where much was learned since the last rehearsal, rehearse, and go back to the best policy if it got worse."""
-        if self.rehearsed_by(model) and self.rehearsals.due(model):
+        if self.may_judge(model) and self.rehearsals.due(model):
             self.rehearse(model)
             if self.rehearsals.clearly_worse():
                 self.rehearsals.go_back(model)
