@@ -7,6 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.units import units_at
@@ -197,10 +199,15 @@ def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 20
             # The mean gradient is not quite zero at a bound; only its scatter matters.
             gradient = linear.gradient[rows].sum(0) - linear.gradient.sum(0) * len(rows) / len(joined)
             moves.append(-np.linalg.solve(linear.normal[rows].sum(0) + ridge, gradient) * problem.size[free])
-        intervals[:, free] = fit.values[free] + np.quantile(moves, [0.025, 0.975], axis=0)
+        intervals[:, free] = fit.values[free] + widening(len(blocks)) * np.quantile(moves, [0.025, 0.975], axis=0)
         intervals = np.clip(intervals, problem.lower, problem.upper)
         intervals[:, hidden] = np.nan
     return values, intervals
+
+
+def widening(blocks: int) -> float:
+    """How much wider than resampling says an interval of so many blocks is: as one of t, which knows their scatter."""
+    return float(np.sqrt(blocks / (blocks - 1)) * student.ppf(0.975, blocks - 1) / norm.ppf(0.975))
 
 
 def join(a: Windows, b: Windows) -> Windows:
