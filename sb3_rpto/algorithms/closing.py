@@ -306,7 +306,7 @@ def renew_source(model: TransferAlgorithm) -> None:
     model.source_timesteps += model._source_world.interact(model, FILL)
 
 
-def learn_in_source(model: TransferAlgorithm, rehearse: Callable[[], None] = lambda: None) -> None:
+def learn_in_source(model: TransferAlgorithm, rehearse: Callable[[], None]) -> None:
     """Learn in the present simulator by rounds while its episodes earn more; the target waits meanwhile.
 
     :param rehearse: called before the first round and after each

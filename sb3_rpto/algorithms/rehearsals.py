@@ -1,4 +1,4 @@
-"""Never worse in the simulator, either: the best policy by whole episodes there, which cost no target step."""
+"""Back to the best policy by whole episodes in the fitted simulator, which cost no target step."""
 
 from __future__ import annotations
 
@@ -28,9 +28,8 @@ MOVED = 1e-3
 class Rehearsals:
     """Lets the deterministic policy play in the fitted simulator, and goes back to the best one where it got worse.
 
-    Warm-started SAC that learns on from what a good policy sees forgets what it does not see any more. The simulator
-    tells for nothing; the first policy to be beaten is the one that came from the source. The best is
-    ``snapshots["simulator"]``.
+    Warm-started SAC that learns on from what a good policy sees may get worse, which the simulator tells for nothing.
+    The first policy to be beaten is the one that came from the source. The best is ``snapshots["simulator"]``.
     """
 
     def __init__(self) -> None:

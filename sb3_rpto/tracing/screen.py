@@ -72,21 +72,21 @@ def screen(problem: Problem, fit: Fit) -> Screening:
 
 
 def _taken(problem: Problem, normal: np.ndarray, sensitivity: np.ndarray) -> list[int | None]:
-    """Of each effect the declared one that does the same, see :class:`Screening`.
+    """Of each effect the known one that does the same, see :class:`Screening`.
 
     :param normal: of all strengths, (f, f)
     """
     simulation = problem.simulation
     strength = np.flatnonzero(simulation.strength)
     groups = [np.flatnonzero(np.isin(strength, np.arange(s.start, s.stop))) for s in simulation.slices]
-    declared = [e for e, effect in enumerate(simulation.effects) if effect.known]
+    known = [e for e, effect in enumerate(simulation.effects) if effect.known]
     size = np.sqrt(np.maximum(np.diag(normal), 1e-12))
     likeness = np.abs(normal / size / size[:, None])
     taken: list[int | None] = []
     for e, g in enumerate(groups):
         alone = np.sqrt(max(0.0, float(np.linalg.eigvalsh(normal[np.ix_(g, g)])[-1]))) if len(g) else 0.0
-        hidden = e not in declared and declared and sensitivity[e] < EXCITED <= alone
-        taken.append(max(declared, key=lambda d: float(likeness[np.ix_(groups[d], g)].max())) if hidden else None)
+        hidden = e not in known and known and sensitivity[e] < EXCITED <= alone
+        taken.append(max(known, key=lambda d: float(likeness[np.ix_(groups[d], g)].max())) if hidden else None)
     return taken
 
 

@@ -12,6 +12,7 @@ from scipy.stats import t as student
 
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.units import units_at
+from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE, Adequacy
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.concentrate import NOTHING
@@ -287,8 +288,8 @@ def _undetermined(problem: Problem, values: np.ndarray, intervals: np.ndarray) -
             is_number = isinstance(effect, Declared)
             where = f"declared {effect.label}" if is_number else f"known {effect.label}, {parameter.name}"
             message = (
-                f"{value:.4g} [{low:.4g}, {high:.4g}]: these data do not tell it; move so that it matters, do not "
-                f"{'declare it, or declare' if is_number else 'give it, or give'} fewer that act alike"
+                f"{value:.4g} {wording.interval(low, high)}: these data do not tell it; move so that it matters, do "
+                f"not {'declare it, or declare' if is_number else 'give it, or give'} fewer that act alike"
             )
             found.append(Finding("undetermined", where, message))
     return found

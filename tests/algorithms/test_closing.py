@@ -479,8 +479,10 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
         verbose=0,
         train=lambda n, batch_size: updates.append(n),
     )
-    closing.learn_in_source(made)  # type: ignore[arg-type]
+    rehearsed: list[None] = []
+    closing.learn_in_source(made, lambda: rehearsed.append(None))  # type: ignore[arg-type]
     assert updates == [30] * rounds
+    assert len(rehearsed) == 1 + rounds
     assert len(noises) == rounds
     assert made.source_timesteps == 5 + 20 * rounds
 
