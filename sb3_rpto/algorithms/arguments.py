@@ -166,6 +166,11 @@ def check_something_to_fit(
         raise ValueError(
             "close_loop=True traces what a MuJoCo simulator lacks: pass dynamics='physical' and a gymnasium MuJoCo env"
         )
+    if config.get("observation_noise") is not None and (close_loop is False or traces_log):
+        raise ValueError(
+            "dynamics_kwargs['observation_noise'] is for traces of a closed loop on transitions of the target; leave "
+            f"it out{': the noise of recordings is estimated' if traces_log else ', or pass close_loop=True'}"
+        )
     if mujoco and "rollout_start" in passed:
         raise ValueError(
             "rollout_start is for one-step branches; dynamics='physical' simulates whole episodes: leave it out"

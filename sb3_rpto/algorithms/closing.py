@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.source import EpisodeSource
-from sb3_rpto.dynamics.base import Transitions
+from sb3_rpto.dynamics.base import Dynamics, Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Declared, from_json
 from sb3_rpto.envs.observations import single_env
@@ -33,6 +33,9 @@ RISEN = 2.0
 MORE = 2
 #: Samples in a window: several steps show what acts late, and contacts do not amplify errors yet.
 WINDOW = 4
+#: What is missing grows with the square of the time, noise does not: where there is some, windows may have so many,
+#: as long as three of four episodes hold them.
+NOISY_WINDOW, SHORT_EPISODES = 6, 0.25
 #: What is found is kept when the one-step error falls below this share of the best without it.
 WORTH = 0.9
 #: Source steps that fill D_source anew.
@@ -92,16 +95,24 @@ class LoopCloser:
             return True
         return dynamics.error(model.transitions("target").take(slice(size - new, None))) > RISEN * self._error
 
+    def keeps_phi(self, dynamics: Dynamics | None) -> bool:
+        """Whether phi stays what the last trace found: one-step fits to noisy transitions would spoil it."""
+        noisy = isinstance(dynamics, PhysicalDynamics) and dynamics.observation_noise is not None
+        return noisy and self._traced_at is not None
+
     def close(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:
-        """Trace on D_target, keep what lowers the error, log it, and renew D_source where another simulator made it."""
+        """Trace on D_target, keep what lowers the error, log it, and renew D_source where another simulator made it.
+
+        The one-step error of noisy observations is mostly noise: where there is some, the report judges.
+        """
         assert model.env is not None
         data = model.transitions("target")
-        before = dynamics.error(data)
-        measured = Measurements.from_replay(model.replay_buffer, model.env)
-        horizon = (WINDOW - 1) * float(single_env(model.env).unwrapped.dt)  # type: ignore[attr-defined]
+        noise, before = dynamics.observation_noise, dynamics.error(data)
+        measured = Measurements.from_replay(model.replay_buffer, model.env, noise=noise)
+        horizon = (window(measured) - 1) * float(single_env(model.env).unwrapped.dt)  # type: ignore[attr-defined]
         report = self._trace(model, dynamics, measured, horizon)
         self._traced_at = model.replay_buffer.target_added
-        added = self._take(model, dynamics, report, data, before)
+        added = self._take(model, dynamics, report, data, before if noise is None else math.inf)
         self._error = dynamics.error(data)
         _say(model, report, added, f"{len(data)} target transitions", before, self._error)
         self.stale = bool(added) or outdated(model, dynamics)
@@ -250,10 +261,16 @@ def _say(model: TransferAlgorithm, report: Report, added: list[str], data: str, 
         warnings.warn(
             f"the trace on {data} is 'unexplained': what it looked for does not account for the difference, and the "
             "policy learns in a simulator that still errs; see print(model.loop.reports[-1]) for which joints, and "
-            "whether the observations hold the model's joints in its order, what else could be declared, and "
-            "dynamics='residual'",
+            "whether the observations hold the model's joints in its order, whether they are noisy "
+            "(dynamics_kwargs={'observation_noise': ...}), what else could be declared, and dynamics='residual'",
             stacklevel=3,
         )
+
+
+def window(measured: Measurements) -> int:
+    """Number of samples in the windows of a trace of transitions."""
+    usual = int(np.quantile([len(episode) for episode in measured.episodes], SHORT_EPISODES))
+    return WINDOW if measured.exact else min(max(usual, WINDOW), NOISY_WINDOW)
 
 
 def deviation_of(traced: Traced) -> np.ndarray:

@@ -143,11 +143,12 @@ class RelativeUpdate(SAC):
         self.policy.set_training_mode(False)  # values for the weights: no dropout, no new batch statistics
         data = self.transitions("target")
         self.logger.record("dynamics/error_before", self.dynamics.error(data))
-        weights = self.fit_weights(data)
-        if weights is not None:
-            self.logger.record("rto/effective_samples", effective_sample_size(weights))
-        for name, value in self.dynamics.fit(data, weights).items():
-            self.logger.record(f"dynamics/{name}", value)
+        if not self._keeps_phi():
+            weights = self.fit_weights(data)
+            if weights is not None:
+                self.logger.record("rto/effective_samples", effective_sample_size(weights))
+            for name, value in self.dynamics.fit(data, weights).items():
+                self.logger.record(f"dynamics/{name}", value)
         self._close_the_loop()
         for name, value in self.dynamics.describe().items():
             self.logger.record(f"dynamics/{name}", value)
@@ -172,6 +173,10 @@ class RelativeUpdate(SAC):
 
     def _adopt_target_rules(self) -> None:
         """From the first fit on the model is one of the target: let what is known of the task be the target's."""
+
+    def _keeps_phi(self) -> bool:
+        """Whether phi is known better than fits to transitions could tell."""
+        return False
 
     def _close_the_loop(self) -> None:
         """After a fit: trace what the simulator lacks, where that was asked for and is due."""

@@ -22,7 +22,7 @@ from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.effects.wrapper import CorrectedEnv, beyond_model
-from sb3_rpto.envs.observations import StateMap, env_name, layers, mujoco_model, single_env, state_map
+from sb3_rpto.envs.observations import StateMap, env_name, layers, mujoco_model, noise_of_each, single_env, state_map
 from sb3_rpto.envs.stance import StandingEnv
 from sb3_rpto.envs.state import copy_env
 
@@ -109,6 +109,9 @@ class PhysicalDynamics(Dynamics):
     :param randomise: each source episode has a phi of its own, drawn from a normal distribution around the estimate
         with so many times its standard deviation; 0: the estimate itself
     :param threads: that simulate; 0: one for each core
+    :param observation_noise: standard deviation of the white noise of each of the target's observations, (d,), or of
+        all alike, in their units: what a sensor shows while the machine stands still. A closed loop's traces reckon
+        with it, and phi stays what they found: one-step errors of noisy states tell less. None: there is none
     :raises ValueError: unknown names (with the near ones), spaces that are not the model's, values out of range
     """
 
@@ -131,6 +134,7 @@ class PhysicalDynamics(Dynamics):
         max_steps: int = 10,
         randomise: float = 0.0,
         threads: int = 0,
+        observation_noise: float | Sequence[float] | None = None,
     ) -> None:
         super().__init__(observation_space, action_space)
         for name, value, least in (
@@ -147,6 +151,8 @@ class PhysicalDynamics(Dynamics):
         self.model, self.recover, self.frame_skip = model, recover, frame_skip
         self.max_step, self.max_steps, self.randomise = max_step, max_steps, randomise
         self.threads = threads
+        width = int(np.prod(observation_space.shape))
+        self.observation_noise = None if observation_noise is None else noise_of_each(observation_noise, width)
         self._twin: CorrectedEnv | None = None
         self._unseen: tuple[str, ...] = ()
         self._entangled: tuple[str, ...] = ()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -88,6 +88,20 @@ def register_state_map(env: str | type[gym.Env], make: Callable[[gym.Env], Recov
         :class:`States`
     """
     _registered[env] = make
+
+
+def noise_of_each(noise: float | Sequence[float] | np.ndarray, width: int) -> np.ndarray:
+    """Standard deviation of each observation's noise, (width,), from one for each or for all.
+
+    :raises ValueError: of another shape, negative or not finite, or no noise at all
+    """
+    given = np.asarray(noise, dtype=float)
+    if given.shape not in ((), (width,)) or not (np.isfinite(given).all() and (given >= 0).all() and given.any()):
+        raise ValueError(
+            f"the noise of the observations is {noise!r}; give a standard deviation above 0, or one for each of the "
+            f"{width} observations, in their units; leave it out for observations without noise"
+        )
+    return np.broadcast_to(given, (width,)).copy()
 
 
 def single_env(env: gym.Env | VecEnv) -> gym.Env:

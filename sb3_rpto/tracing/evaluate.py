@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
-from sb3_rpto.tracing.identify import TRUST, Problem
+from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.windows import Windows, cut, first_sample
 
@@ -115,7 +115,7 @@ def whole_runs(
     differences = []
     for e in data.episodes:
         one = replace(data, episodes=[e])
-        length = float(e.time[-1] - e.time[first_sample(simulation.model, e, data.exact)]) * 0.999
+        length = float(e.time[-1] - e.time[first_sample(simulation.model, e, data.whole_states)]) * 0.999
         try:
             windows = cut(simulation.model, one, sigma, length, 1)
         except ValueError:
@@ -159,7 +159,7 @@ def noise_floor(
             continue
         problem = Problem(simulation, windows, [Scales()] * len(simulation.effects))
         count, index = len(windows), np.tile(np.arange(len(windows)), DRAWS)
-        starts = rng.standard_normal((len(index), windows.spread.shape[1])) / TRUST
+        starts = rng.standard_normal((len(index), windows.spread.shape[1])) / windows.trust
         true = problem.predict(np.tile(values, (count, 1)), np.zeros_like(starts[:count]), np.arange(count))[index]
         off = problem.predict(np.tile(values, (len(index), 1)), starts, index)
         noise = rng.standard_normal(true.shape) * windows.sigma

@@ -15,8 +15,6 @@ from sb3_rpto.tracing.windows import Windows
 
 #: Where a simulation became unstable, its residual in units of the noise.
 UNSTABLE = 1e4
-#: The smoothed start of a window may err by so many times its computed spread: motion is not a cubic.
-TRUST = 3.0
 #: Weak pull of an effect's parameters towards their null values, in plausible sizes.
 RIDGE = 30.0
 #: Finite differences, in plausible sizes: at a null value they are as wide as the effect must be to show.
@@ -128,7 +126,7 @@ class Problem:
 
     def _predict(self, values: np.ndarray, starts: np.ndarray, index: np.ndarray) -> np.ndarray:
         w, model = self.windows, self.simulation.model
-        shift = starts * w.spread[index] * TRUST
+        shift = starts * w.spread[index] * w.trust
         qpos, qvel = moved(model, w.qpos[index], shift[:, : model.nv]), w.qvel[index] + shift[:, model.nv :]
         self.simulation.undo_sensors(values, qpos, qvel, w.qacc[index])
         q, v = self.simulation.rollout(values, qpos, qvel, w.drive.take(index))
@@ -385,6 +383,8 @@ class Problem:
         for _ in range(draws):
             r = rng.standard_normal(mask.shape) * mask
             if jx.shape[2]:
+                if w.noisy_starts:
+                    r -= np.einsum("wrx,wx->wr", jx, rng.standard_normal((len(r), jx.shape[2])))
                 hxx = np.einsum("wrx,wry->wxy", jx, jx) + np.eye(jx.shape[2])
                 move = np.linalg.solve(hxx, np.einsum("wrx,wr->wx", jx, r)[:, :, None])[:, :, 0]
                 r = r - np.einsum("wrx,wx->wr", jx, move)

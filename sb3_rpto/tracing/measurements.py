@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,17 @@ if TYPE_CHECKING:
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
+class Noise(NamedTuple):
+    """Standard deviations of the white noise of whole states, where they are known.
+
+    :param qpos: of each position column in rad or m, (m,)
+    :param qvel: of each velocity column in rad/s or m/s, (nv,)
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class Measurements:
     """Recorded episodes with the names of their columns and all that was found while reading them.
@@ -37,6 +48,7 @@ class Measurements:
     :param exact: whether the samples come from a simulator: no measurement noise, exact velocities
     :param simulated: whether they come from the model's own steps in time, with noise
     :param touching: whether contacts come and go in these measured data
+    :param noise: of positions and velocities, where it is known; None: it is estimated from the positions
     """
 
     episodes: list[Episode]
@@ -46,6 +58,12 @@ class Measurements:
     exact: bool = False
     simulated: bool = False
     touching: bool = False
+    noise: Noise | None = None
+
+    @property
+    def whole_states(self) -> bool:
+        """Whether a prediction may begin at a sample itself: exact, or with positions and velocities of known noise."""
+        return self.exact or self.noise is not None
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -161,7 +179,14 @@ class Measurements:
         return cls(episodes, columns, findings)
 
     @classmethod
-    def from_replay(cls, buffer: "ReplayBuffer", env: "gym.Env | VecEnv", *, exact: bool = True) -> "Measurements":
+    def from_replay(
+        cls,
+        buffer: "ReplayBuffer",
+        env: "gym.Env | VecEnv",
+        *,
+        exact: bool = True,
+        noise: float | Sequence[float] | np.ndarray | None = None,
+    ) -> "Measurements":
         """Read the transitions of an SB3 replay buffer, of a :class:`~sb3_rpto.DualReplayBuffer` those of the target.
 
         Observations are mapped back to states (:func:`sb3_rpto.envs.observations.state_map`), actions to the commands
@@ -174,12 +199,15 @@ class Measurements:
             [-1, 1] as SB3 stores them
         :param env: the environment, with the wrappers that it had; it is neither reset nor stepped
         :param exact: whether the transitions come from a simulator; False for a machine behind the same observations
+        :param noise: standard deviation of the white noise of each observation, (d,), or of all alike, in their units;
+            the data are not exact then, and it is not estimated: at the rate of control it hardly can be
         :raises ValueError: no buffer of vectors, no MuJoCo model, actions of another shape than the buffer's or the
-            actuators', states that cannot be recovered, NaN, no episode of two transitions
+            actuators', states that cannot be recovered, NaN, no episode of two transitions, a noise that is negative
+            or of another length than the observations
         """
         from sb3_rpto.tracing.replay import from_replay
 
-        return from_replay(buffer, env, exact)
+        return from_replay(buffer, env, exact, noise)
 
     @classmethod
     def from_minari(cls, dataset: Any, env: "gym.Env | VecEnv | None" = None) -> "Measurements":

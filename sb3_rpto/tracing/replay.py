@@ -13,14 +13,25 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.buffers import DualReplayBuffer
-from sb3_rpto.envs.observations import States, env_name, layers, mujoco_model, single_env, state_map
+from sb3_rpto.envs.observations import (
+    StateMap,
+    States,
+    env_name,
+    layers,
+    mujoco_model,
+    noise_of_each,
+    single_env,
+    state_map,
+)
 from sb3_rpto.tracing import checks
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.columns import Columns, columns_of, joint_of
 from sb3_rpto.tracing.episodes import Episode
-from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.measurements import Measurements, Noise
 
 MIN_TRANSITIONS = 2
+#: Draws from which the noise of states follows from that of observations.
+DRAWS = 10_000
 ALL = "all episodes"
 
 
@@ -32,7 +43,12 @@ class Run(NamedTuple):
     actions: np.ndarray  # (T - 1, n), as given to env.step
 
 
-def from_replay(buffer: ReplayBuffer, env: gym.Env | VecEnv, exact: bool = True) -> Measurements:
+def from_replay(
+    buffer: ReplayBuffer,
+    env: gym.Env | VecEnv,
+    exact: bool = True,
+    noise: float | Sequence[float] | np.ndarray | None = None,
+) -> Measurements:
     """See :meth:`sb3_rpto.tracing.Measurements.from_replay`."""
     env = single_env(env)
     mujoco_model(env)
@@ -61,7 +77,9 @@ def from_replay(buffer: ReplayBuffer, env: gym.Env | VecEnv, exact: bool = True)
     if broken:
         message = f"{broken} time(s) a transition does not begin where one before it ended; cut there"
         findings.append(Finding("gap", ALL, message))
-    return build(runs, env, exact, findings)
+    if noise is not None:
+        noise = noise_of_each(noise, int(np.prod(side.obs_shape)))
+    return build(runs, env, exact and noise is None, findings, noise)
 
 
 def from_minari(dataset: Any, env: gym.Env | VecEnv | None = None) -> Measurements:
@@ -129,13 +147,16 @@ def chain(observations: np.ndarray, next_observations: np.ndarray, dones: np.nda
     return [np.array(rows) for rows in chains], sum(end + interleaved < len(dones) for end in ends)
 
 
-def build(runs: Sequence[Run], env: gym.Env, exact: bool, findings: list[Finding]) -> Measurements:
+def build(
+    runs: Sequence[Run], env: gym.Env, exact: bool, findings: list[Finding], noise: np.ndarray | None = None
+) -> Measurements:
     """Turn observations into states and actions into commands; see :meth:`Measurements.from_replay`.
 
     :param runs: observations and actions
     :param env: whose observations they are
     :param exact: as in :class:`Measurements`
     :param findings: what was found so far, is added to
+    :param noise: standard deviation of each observation's, (d,); None: not known
     """
     model, recover = mujoco_model(env), state_map(env)
     columns, dt = columns_of(model), float(env.unwrapped.dt)  # type: ignore[attr-defined]
@@ -151,7 +172,8 @@ def build(runs: Sequence[Run], env: gym.Env, exact: bool, findings: list[Finding
         if not (np.isfinite(run.observations).all() and np.isfinite(run.actions).all()):
             raise ValueError(f"episode {run.name} of {env_name(env)} has NaN or infinite values; remove it")
     actions = _commands(np.concatenate([run.actions for run in kept]), env, findings)
-    states = recover(np.concatenate([run.observations for run in kept]))
+    observations = np.concatenate([run.observations for run in kept])
+    states = recover(observations)
     repairs = _Repairs(columns, states, env_name(env))
     known = np.ones(len(states.qpos), dtype=bool)
     for flags, seen in ((states.known_qpos, repairs.seen_qpos), (states.known_qvel, repairs.seen_qvel)):
@@ -183,7 +205,39 @@ def build(runs: Sequence[Run], env: gym.Env, exact: bool, findings: list[Finding
                 message = f"unknown in {(~flags[:, i]).sum()} of {len(flags)} samples, which are not usable"
                 findings.append(Finding("clipped", f"{ALL}, {prefix}.{name}", message))
     columns = replace(columns, missing=repairs.missing)
-    return Measurements(episodes, columns, findings + repairs.findings(), repairs.unobserved, exact)
+    known_noise = None if noise is None else state_noise(recover, observations, noise, dt, repairs)
+    return Measurements(episodes, columns, findings + repairs.findings(), repairs.unobserved, exact, noise=known_noise)
+
+
+def state_noise(recover: StateMap, observations: np.ndarray, noise: np.ndarray, dt: float, repairs: _Repairs) -> Noise:
+    """Noise of the states behind noisy observations, by draws of it; none where no observation tells of one.
+
+    :param recover: states from observations
+    :param observations: (n, d)
+    :param noise: of each, (d,)
+    :param dt: time between two of them in s
+    :param repairs: knows which velocities are differences of positions
+    """
+    rng = np.random.default_rng(0)
+    rows = np.resize(np.arange(len(observations)), DRAWS)
+    shown, drawn = (
+        recover(o) for o in (observations[rows], observations[rows] + noise * rng.standard_normal((DRAWS, len(noise))))
+    )
+    turns = drawn.qpos - shown.qpos
+    wrapped = list(shown.wrapped)
+    turns[:, wrapped] = (turns[:, wrapped] + np.pi) % (2 * np.pi) - np.pi
+    qpos = _scatter(turns, shown.known_qpos & drawn.known_qpos)
+    qvel = _scatter(drawn.qvel - shown.qvel, shown.known_qvel & drawn.known_qvel)
+    for name in repairs.missing:
+        i = repairs.columns.qvel.index(name)
+        qvel[i] = qpos[repairs.columns.qpos.index(name)] / (np.sqrt(2) * dt)
+    return Noise(qpos, qvel)
+
+
+def _scatter(moved: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Root mean square of each column's known values, (m,); 0 where there are none."""
+    squares = np.where(known, np.nan_to_num(moved), 0.0) ** 2
+    return np.asarray(np.sqrt(squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1)))
 
 
 def _commands(actions: np.ndarray, env: gym.Env, findings: list[Finding]) -> np.ndarray:

@@ -69,7 +69,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     qpos = np.tile(nominal.qpos0, (len(time), 1))
     qvel = np.zeros((len(time), nominal.nv))
     shown = np.zeros((len(time), nominal.nv))
-    low = (lambda signal: signal) if data.exact else _low_pass(h, len(time))
+    low = (lambda signal: signal) if data.whole_states else _low_pass(h, len(time))
     for column, address in enumerate(addresses):
         path = low(np.interp(time, e.time, e.qpos[:, column]))
         qpos[:, address] = path
@@ -78,7 +78,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
             shown[:, dof] = path
             qvel[:, dof] = np.gradient(path, h)
     for column, dof in enumerate(velocity_addresses(nominal, data)):
-        if data.exact or dof not in dof_of.values():  # quaternions are not differentiated
+        if data.whole_states or dof not in dof_of.values():  # quaternions are not differentiated
             qvel[:, dof] = low(np.interp(time, e.time, e.qvel[:, column]))
     active = [
         (effect, values[None, s])
@@ -138,7 +138,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     load = np.stack([low(column) for column in load.T], axis=1)
     extra = np.stack([low(column) for column in extra.T], axis=1)
     force = needed - load - extra
-    edge = 1 if data.exact else min(round(EDGE / (_cutoff(h) * h)), len(time) // 4)
+    edge = 1 if data.whole_states else min(round(EDGE / (_cutoff(h) * h)), len(time) // 4)
     arrays = (a[edge : len(time) - edge] for a in (time - time[0], shown, qvel, load, commands, force))
     return ForceResidual(e.name, *arrays)
 

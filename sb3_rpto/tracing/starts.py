@@ -11,6 +11,8 @@ from sb3_rpto.tracing.measurements import Measurements
 
 #: Half the time, in s, over which the state at a window's start is smoothed, and the fewest samples on each side.
 HALF_WIDTH, HALF_COUNT = 0.025, 4
+#: The smoothed start of a window may err by so many times its computed spread: motion is not a cubic.
+TRUST = 3.0
 
 
 def half_step(model: mujoco.MjModel) -> float:
@@ -68,8 +70,12 @@ def smoothed_rotation(
     for turn, quaternion in zip(turns, around):
         mujoco.mju_subQuat(turn, quaternion, here)
     turn, velocity, acceleration, spread, unit = _cubic(t, turns, lead)
-    noise = 2 * np.sqrt((sigma**2).sum() / 3)
-    return turned(here[None], turn[None])[0], velocity, acceleration, spread * noise / unit
+    return turned(here[None], turn[None])[0], velocity, acceleration, spread * _about_an_axis(sigma) / unit
+
+
+def _about_an_axis(sigma: np.ndarray) -> float:
+    """Noise of a rotation about each axis in rad, from that of a unit quaternion's numbers, (4,)."""
+    return float(2 * np.sqrt((sigma**2).sum() / 3))
 
 
 def _around(episode: Episode, index: int) -> tuple[slice, np.ndarray]:
@@ -102,13 +108,23 @@ def start_state(
     The spread is of positions as :func:`moved` moves them, then of velocities.
     """
     qpos, (qvel, qacc), spread = model.qpos0.copy(), np.zeros((2, model.nv)), np.zeros(2 * model.nv)
-    if data.exact:
+    if data.whole_states:
         dofs = velocity_addresses(model, data)
         qpos[addresses] = episode.qpos[index]
         qvel[dofs] = episode.qvel[index]
         if index + 1 < len(episode):
             after = episode.qvel[index + 1] - episode.qvel[index]
             qacc[dofs] = after / (episode.time[index + 1] - episode.time[index])
+        if data.noise is not None and not data.exact:
+            if not data.simulated:
+                qvel -= half_step(model) * qacc
+            spread[model.nv + dofs] = data.noise.qvel
+            noise = np.zeros(model.nq)
+            noise[addresses] = data.noise.qpos
+            for adr, dof in straight(model).items():
+                spread[dof] = noise[adr]
+            for adr, dof in turning(model).items():
+                spread[dof : dof + 3] = _about_an_axis(noise[adr : adr + 4])
         return qpos, qvel, qacc, spread
     lead = half_step(model)
     position, velocity, acceleration, deviation = smoothed_state(episode, index, sigma, lead)

@@ -15,7 +15,7 @@ from sb3_rpto.effects.simulation import memory, names_of
 from sb3_rpto.tracing import checks
 from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, half_step, start_state
+from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, TRUST, half_step, start_state
 
 #: Seconds of commands kept from before a window, for effects that delay and filter: four constants of the slowest lag.
 MEMORY = 1.0
@@ -48,6 +48,7 @@ class Windows:
     :param time: of the start in the episode, in s, (W,)
     :param exact: whether the samples come from a simulator
     :param touching: whether contacts come and go in measured data
+    :param noisy_starts: whether the starts are samples with noise of that spread, not smoothed states
     """
 
     qpos: np.ndarray
@@ -65,13 +66,19 @@ class Windows:
     time: np.ndarray
     exact: bool
     touching: bool
+    noisy_starts: bool
+
+    @property
+    def trust(self) -> float:
+        """How many times their spread the starts may err by at one standard deviation."""
+        return 1.0 if self.noisy_starts else TRUST
 
     def __len__(self) -> int:
         return len(self.qpos)
 
     def take(self, index: np.ndarray) -> Windows:
         """The windows at ``index``."""
-        shared = ("drive", "sigma", "columns", "exact", "touching")
+        shared = ("drive", "sigma", "columns", "exact", "touching", "noisy_starts")
         own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in shared}
         return replace(self, drive=self.drive.take(index), **own)
 
@@ -84,9 +91,10 @@ def noise_levels(data: Measurements) -> np.ndarray:
     """
     levels = []
     for i in range(len(data.columns.qpos)):
-        if data.exact:
+        if data.whole_states:
             spread = np.std(np.concatenate([e.qpos[:, i] for e in data.episodes]))
-            levels.append(EXACT * max(float(spread), 1e-3))
+            known = 0.0 if data.noise is None or data.exact else float(data.noise.qpos[i])
+            levels.append(max(known, EXACT * max(float(spread), 1e-3)))
             continue
         at = [_difference_noise(data.episodes, i, order) for order in range(3, 8)]
         order = next((k for k in range(4) if at[k + 1] > 0.93 * at[k]), 4)
@@ -166,11 +174,11 @@ def stiff(model: mujoco.MjModel) -> bool:
     return bool(np.abs(np.linalg.eigvals(rates)).max(initial=0.0) * model.opt.timestep > STIFF)
 
 
-def first_sample(model: mujoco.MjModel, episode: Episode, exact: bool) -> int:
+def first_sample(model: mujoco.MjModel, episode: Episode, whole_states: bool) -> int:
     """Where the first window may begin: what its actuators remember is recorded, and smoothing has both its sides."""
     known = int(np.searchsorted(episode.time, episode.time[0] + memory(model) - 1e-9))
     step = float(np.median(np.diff(episode.time)))
-    return min(max(known, 0 if exact else max(HALF_COUNT, round(HALF_WIDTH / step))), len(episode) - 1)
+    return min(max(known, 0 if whole_states else max(HALF_COUNT, round(HALF_WIDTH / step))), len(episode) - 1)
 
 
 def cut(
@@ -196,7 +204,7 @@ def cut(
         raise ValueError(f"a window of {horizon:g} s holds fewer than two steps of {step:.4g} s; raise horizon")
     starts = []
     for number, e in enumerate(data.episodes):
-        begin = first_sample(model, e, data.exact)
+        begin = first_sample(model, e, data.whole_states)
         while True:
             end = int(np.searchsorted(e.time, e.time[begin] + horizon + 1e-9, side="right"))
             if e.time[-1] < e.time[begin] + horizon - 1e-9 or end - begin < 3:
@@ -278,6 +286,7 @@ def _build(
         np.array([data.episodes[number].time[begin] for number, begin, _ in starts]),
         data.exact,
         data.touching,
+        data.noise is not None and not data.exact,
     )
 
 

@@ -131,6 +131,53 @@ def test_a_trace_knows_the_effects_that_were_passed(soon: None) -> None:
     assert dynamics(made).describe()["command_delay(slide).delay"] == pytest.approx(0.1, rel=0.02)
 
 
+def noisy(noise: np.ndarray) -> gym.Env:
+    """A target with friction whose sensors are noisy."""
+    env, rng = target(friction()), np.random.default_rng(0)
+    return gym.wrappers.TransformObservation(
+        env, lambda observation: observation + noise * rng.standard_normal(len(noise)), env.observation_space
+    )
+
+
+@cache
+def learned_from_noise() -> RPTO:
+    noise = np.array([3e-4] * 5 + [3e-3] * 3 + [0.0])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(closing, "FIRST", 120)
+        patch.setattr(closing, "FILL", 25)
+        patch.setattr(closing, "FRESH", 25)
+        passed = {"observation_noise": noise.tolist()}
+        made = model([], target_env=noisy(noise), dynamics_kwargs=passed, close_loop=["coulomb_friction"])
+        return made.learn(170, source_timesteps=180)
+
+
+def test_what_noisy_sensors_show_is_explained_all_the_same() -> None:
+    made = learned_from_noise()
+    assert made.loop is not None
+    (report,) = made.loop.reports
+    assert report.verdict == "explained"
+    assert made.loop.accounts
+    assert dynamics(made).names == ["pole.length", "coulomb_friction(slider).level"]
+
+
+def test_phi_stays_what_a_trace_found_where_sensors_are_noisy() -> None:
+    made = learned_from_noise()
+    assert made.loop is not None
+    (report,) = made.loop.reports
+    traced = np.concatenate([t.effect.values for t in (*report.declared, *report.effects)])
+    made.fit_dynamics()
+    np.testing.assert_array_equal(dynamics(made).values, traced)
+    made.loop.forget_target()  # of another target nothing is known
+    assert not made.loop.keeps_phi(made.dynamics)
+
+
+def test_a_checkpoint_knows_the_noise(tmp_path: Path) -> None:
+    made = learned_from_noise()
+    made.save(tmp_path / "model")
+    noise = dynamics(RPTO.load(tmp_path / "model")).observation_noise
+    np.testing.assert_array_equal(noise, dynamics(made).observation_noise)
+
+
 def test_no_target_step_is_spent_on_tracing() -> None:
     made = learned()
     assert made.num_timesteps == 100
@@ -410,6 +457,9 @@ def test_long_names_of_effects_are_logged(soon: None) -> None:
         ({"dynamics": "ensemble", "declared": ()}, "close_loop=True traces what a MuJoCo simulator lacks"),
         ({"close_loop": False, "declared": ()}, "nothing to fit"),
         ({"declared": ["pole.lenght"]}, "has no 'lenght'; did you mean 'length'"),
+        ({"dynamics_kwargs": {"observation_noise": 1e-3}, "close_loop": False}, "or pass close_loop=True"),
+        ({"dynamics_kwargs": {"observation_noise": -1e-3}}, "standard deviation above 0"),
+        ({"dynamics_kwargs": {"observation_noise": [1e-3] * 5}}, "each of the 9 observations"),
     ],
 )
 def test_what_cannot_be_closed_is_refused(settings: dict[str, object], said: str) -> None:
