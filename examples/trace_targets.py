@@ -2,11 +2,13 @@
 
     python examples/trace_targets.py --tasks cheetah --targets 0 1 2 3 4 5
     python examples/trace_targets.py --tasks hopper --targets 0 --noise 0.001
+    python examples/trace_targets.py --tasks double-pendulum --targets 0 1 2 --sensors 0.001 0.005
 
 The targets are those of examples/closed_loop_study.py, by number, so that ones can be taken that nothing was tuned on.
 The source's policy acts in each for 200 steps, as at the beginning of a transfer; no policy learns. With --noise it is
-ten runs of at most 100 steps, of which a log shows positions alone, with that noise, at about 100 Hz. Finished traces
-are kept in --runs, the table goes to --out.
+ten runs of at most 100 steps, of which a log shows positions alone, with that noise, at about 100 Hz. With --sensors it
+is the 200 steps, observed with that noise, which the trace is told. Finished traces are kept in --runs, the table goes
+to --out.
 """
 
 from __future__ import annotations
@@ -17,41 +19,52 @@ import platform
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
 from tqdm import tqdm
 
 from sb3_rpto.experiments import closed_loop as study
-from sb3_rpto.experiments.first_trace import Job, run
+from sb3_rpto.experiments.first_trace import CAUSES, Job, run
 
 
 def main() -> None:
     """Trace what is missing, then write the table of what was asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--tasks", nargs="+", default=list(study.TASKS), choices=list(study.TASKS))
-    parser.add_argument("--shifts", nargs="+", default=list(study.SHIFTS), choices=study.SHIFTS)
+    parser.add_argument("--shifts", nargs="+", default=list(study.SHIFTS), choices=CAUSES)
     parser.add_argument("--targets", nargs="+", type=int, default=list(range(6)))
     parser.add_argument("--noise", type=float, default=0.0, help="of a log's positions in rad or m (default: exact)")
+    parser.add_argument("--sensors", nargs="+", type=float, default=[0.0], help="noise of observed positions")
     parser.add_argument("--workers", type=int, default=2, help="traces side by side")
     parser.add_argument("--runs", type=Path, default=Path("runs/trace_targets"), help="where single traces are kept")
     parser.add_argument("--out", type=Path, help="where the table goes")
     a = parser.parse_args()
-    a.out = a.out or Path(__file__).parent / "results" / ("trace_logs" if a.noise else "trace_targets")
+    a.out = a.out or Path(__file__).parent / "results" / (
+        "trace_logs" if a.noise else "trace_sensors" if any(a.sensors) else "trace_targets"
+    )
     for folder in (a.runs, a.out):
         folder.mkdir(parents=True, exist_ok=True)
     for task in a.tasks:
         study.source_agent(task, a.runs)
     # Target by target, so that an unfinished table is a fair sample.
-    jobs = [Job(task, shift, target, noise=a.noise) for target in a.targets for task in a.tasks for shift in a.shifts]
+    places = product(a.targets, a.sensors, a.tasks, a.shifts)
+    jobs = [Job(task, shift, target, target if noisy else 0, a.noise, noisy) for target, noisy, task, shift in places]
     with ProcessPoolExecutor(a.workers) as pool:
         rows = list(tqdm(pool.map(partial(run, folder=a.runs), jobs), total=len(jobs), desc="traces"))
-    table = pd.DataFrame(rows).sort_values(["task", "shift", "target"])
+    table = pd.DataFrame(rows).sort_values(["task", "sensors", "shift", "target"])
     table.to_csv(a.out / "traces.csv", index=False, float_format="%.4g")
     packages = ("sb3-rpto", "torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
     manifest = {
         "command": "python examples/trace_targets.py",
-        "settings": {"tasks": a.tasks, "shifts": a.shifts, "targets": a.targets, "noise": a.noise},
+        "settings": {
+            "tasks": a.tasks,
+            "shifts": a.shifts,
+            "targets": a.targets,
+            "noise": a.noise,
+            "sensors": a.sensors,
+        },
         "versions": {name: version(name) for name in packages},
         "python": platform.python_version(),
     }

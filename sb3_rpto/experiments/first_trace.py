@@ -8,19 +8,26 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_rpto.algorithms.closing import FIRST, WINDOW
+from sb3_rpto.algorithms.closing import FIRST, window
 from sb3_rpto.effects import Declared
-from sb3_rpto.experiments.closed_loop import TASKS, make_source, make_target, shifted, source_agent
+from sb3_rpto.experiments.closed_loop import SHIFTS, TASKS, make_source, make_target, shifted, source_agent
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.columns import columns_of
 from sb3_rpto.tracing.report import write_atomically
 
 #: A noisy log: runs, steps of the policy in each, and the longest time between two samples in s.
 RUNS, STEPS, SAMPLED = 10, 100, 0.01
+#: Which observations are speeds; what comes after them are forces of constraints, which are shown without noise.
+SPEEDS = {"double-pendulum": slice(5, 8), "hopper": slice(5, 11), "cheetah": slice(8, 17)}
+#: A shift of the declared numbers, and a cause outside of the library: gusts of so many N on the first coordinate,
+#: a sine of so many Hz, whose phase nobody records.
+GUSTS, FORCE, FREQUENCY = "gusts", 20.0, 1.0
+CAUSES = (*SHIFTS, GUSTS)
 
 
 @dataclass(frozen=True)
@@ -28,10 +35,12 @@ class Job:
     """One trace.
 
     :param task: of :data:`sb3_rpto.experiments.closed_loop.TASKS`
-    :param shift: of :data:`sb3_rpto.experiments.closed_loop.SHIFTS`
+    :param shift: of :data:`CAUSES`
     :param target: number that the target is drawn from
     :param seed: of the target's starts and the policy's noise
-    :param noise: standard deviation of a log's positions in rad or m, velocities not measured; 0: exact transitions
+    :param noise: standard deviation of a log's positions in rad or m, velocities not measured; 0: transitions
+    :param sensors: that of the positions which transitions show, and ten times as many rad/s or m/s of the speeds,
+        which the trace is told; 0: exact transitions
     """
 
     task: str
@@ -39,6 +48,26 @@ class Job:
     target: int
     seed: int = 0
     noise: float = 0.0
+    sensors: float = 0.0
+
+
+class Gusts(gym.Wrapper):
+    """A force that changes with time alone, with a phase of its own in each episode."""
+
+    def __init__(self, env: gym.Env, seed: int) -> None:
+        super().__init__(env)
+        self._rng = np.random.default_rng(seed)
+
+    def reset(self, **kwargs: Any) -> Any:
+        """Begin an episode at another time of the storm."""
+        self._phase = self._rng.uniform(0, 2 * np.pi)
+        return self.env.reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        """Blow, and step."""
+        robot: Any = self.unwrapped
+        robot.data.qfrc_applied[0] = FORCE * np.sin(2 * np.pi * FREQUENCY * robot.data.time + self._phase)
+        return self.env.step(action)
 
 
 def run(job: Job, folder: Path) -> dict[str, Any]:
@@ -49,12 +78,12 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
     :return: verdict, R before and after, what was named, what was there, largest relative error of the declared
         numbers, seconds
     """
-    how = f"_{job.noise:g}" if job.noise else ""
+    how = f"_{job.noise:g}" if job.noise else f"_sensors_{job.sensors:g}" if job.sensors else ""
     path = folder / f"trace_{job.task}_{job.shift}_{job.target}_{job.seed}{how}.json"
     if not path.exists():
         source = make_source(job.task)
         data = noisy_log(job, folder) if job.noise else first_transitions(job, folder)
-        horizon = None if job.noise else (WINDOW - 1) * float(source.unwrapped.dt)  # type: ignore[attr-defined]
+        horizon = None if job.noise else (window(data) - 1) * float(source.unwrapped.dt)  # type: ignore[attr-defined]
         began = time.perf_counter()
         report = trace(source, data, TASKS[job.task].declared, seed=job.seed, horizon=horizon, threads=1)
         row = {**asdict(job), **judged(job, report), "seconds": round(time.perf_counter() - began, 1)}
@@ -66,11 +95,35 @@ def first_transitions(job: Job, folder: Path) -> Measurements:
     """As many target transitions as a transfer takes before its first trace, by the source's stochastic policy."""
     agent, _ = source_agent(job.task, folder)
     settings: dict[str, Any] = {"buffer_size": FIRST, "learning_starts": 0, "gradient_steps": 0, "seed": job.seed}
-    target = Monitor(make_target(job.task, job.shift, job.target))
+    target: gym.Env = make_target(job.task, "declared" if job.shift == GUSTS else job.shift, job.target)
+    if job.shift == GUSTS:
+        target = Gusts(target, job.seed)
+    noise = sensor_noise(job, target) if job.sensors else None
+    if noise is not None:
+        target = noisy(target, noise, job.seed)
+    target = Monitor(target)
     sac = SAC.load(agent, env=target, device="cpu", **settings)
     sac.learn(FIRST)  # collects, without an update
     assert sac.replay_buffer is not None
-    return Measurements.from_replay(sac.replay_buffer, target)
+    return Measurements.from_replay(sac.replay_buffer, make_source(job.task), noise=noise)
+
+
+def sensor_noise(job: Job, env: gym.Env) -> np.ndarray:
+    """Standard deviation of each observation, (d,)."""
+    assert env.observation_space.shape is not None
+    speeds = SPEEDS[job.task]
+    noise = np.full(env.observation_space.shape, job.sensors)
+    noise[speeds] *= 10
+    noise[speeds.stop :] = 0
+    return noise
+
+
+def noisy(env: gym.Env, noise: np.ndarray, seed: int) -> gym.Env:
+    """The environment behind sensors with white noise of this standard deviation, (d,)."""
+    rng = np.random.default_rng(seed)
+    return gym.wrappers.TransformObservation(
+        env, lambda observation: observation + noise * rng.standard_normal(noise.shape), env.observation_space
+    )
 
 
 def noisy_log(job: Job, folder: Path) -> Measurements:
@@ -106,12 +159,17 @@ def noisy_log(job: Job, folder: Path) -> Measurements:
 
 def judged(job: Job, report: Report) -> dict[str, Any]:
     """What a report says, beside what is true."""
-    truth = {e.label: float(e.values[0]) for e in shifted(job.task, job.shift, job.target)}
-    there = {e.label for e in shifted(job.task, job.shift, job.target) if not isinstance(e, Declared)}
+    effects = shifted(job.task, "declared" if job.shift == GUSTS else job.shift, job.target)
+    truth = {e.label: float(e.values[0]) for e in effects}
+    there = {e.label for e in effects if not isinstance(e, Declared)}
     named = {traced.effect.label for traced in report.effects}
     values = {t.effect.label: float(t.effect.values[0]) for t in report.declared}
     nominal = {d.label: float(d.parameters[0].null) for d in (t.effect for t in report.declared)}
     off = {label: abs(value / truth.get(label, nominal[label]) - 1) for label, value in values.items()}
+    told = [t for t in (*report.declared, *report.effects) if t.effect.label in {*truth, *nominal}]
+    held = [
+        t.interval[0, 0] <= truth.get(t.effect.label, nominal.get(t.effect.label)) <= t.interval[1, 0] for t in told
+    ]
     return {
         "verdict": report.verdict,
         "R_before": report.adequacy_before.ratio,
@@ -121,6 +179,11 @@ def judged(job: Job, report: Report) -> dict[str, Any]:
         "right": len(named & there),
         "named_effects": "; ".join(sorted(named)),
         "declared_error_median": float(np.median(list(off.values()))),
+        "true_effects_off": "; ".join(
+            f"{t.effect.values[0] / truth[t.effect.label] - 1:+.3f}" for t in report.effects if t.effect.label in there
+        ),
+        "intervals": len(held),
+        "hold_the_truth": int(sum(held)),
         "declared_error_max": float(max(off.values())),
         "declared_worst": max(off, key=lambda label: off[label]),
     }

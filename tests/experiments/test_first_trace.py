@@ -44,6 +44,26 @@ def test_a_log_holds_noisy_positions_of_the_simulators_steps(folder: Path) -> No
     assert noise.std() == pytest.approx(1e-3, rel=0.1)
 
 
+def test_noisy_sensors_show_the_same_transitions_with_noise_that_is_told(folder: Path) -> None:
+    job = Job("double-pendulum", "none", 0, sensors=1e-3)
+    data = first_transitions(job, folder)
+    assert not data.exact
+    assert data.noise is not None
+    assert data.noise.qpos == pytest.approx(np.full(3, 1e-3), rel=0.05)
+    assert data.noise.qvel == pytest.approx(np.full(3, 1e-2), rel=0.05)
+    exact = first_transitions(Job("double-pendulum", "none", 0), folder)
+    difference = data.episodes[0].qpos[0] - exact.episodes[0].qpos[0]  # the policy sees noise: its actions differ
+    assert 0 < np.abs(difference).max() < 5e-3
+
+
+def test_gusts_push_the_cart_and_nobody_records_them(folder: Path) -> None:
+    still, pushed = (first_transitions(Job("double-pendulum", shift, 0), folder) for shift in ("declared", "gusts"))
+    a, b = still.episodes[0], pushed.episodes[0]
+    np.testing.assert_array_equal(a.qpos[0], b.qpos[0])
+    n = min(len(a), len(b))
+    assert np.abs(a.qpos[:n, 0] - b.qpos[:n, 0]).max() > 5e-3
+
+
 @pytest.mark.parametrize(("shift", "named"), [("undeclared", "coulomb_friction(slider)"), ("none", "")])
 def test_a_trace_is_compared_with_the_truth_and_made_once(
     shift: str, named: str, folder: Path, monkeypatch: pytest.MonkeyPatch
