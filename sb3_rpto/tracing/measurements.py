@@ -46,7 +46,7 @@ class Measurements:
     :param findings: what a reader of the results must know; nothing is repaired without one
     :param unobserved: names of ``columns.qpos`` that were not measured: not to be compared with a prediction
     :param exact: whether the samples come from a simulator: no measurement noise, exact velocities
-    :param simulated: whether they come from the model's own steps in time, with noise
+    :param simulated: whether the model's own steps in time are to meet them, noise apart
     :param touching: whether contacts come and go in these measured data
     :param noise: of positions and velocities, where it is known; None: it is estimated from the positions
     """
@@ -200,7 +200,8 @@ class Measurements:
         :param env: the environment, with the wrappers that it had; it is neither reset nor stepped
         :param exact: whether the transitions come from a simulator; False for a machine behind the same observations
         :param noise: standard deviation of the white noise of each observation, (d,), or of all alike, in their units;
-            the data are not exact then, and it is not estimated: at the rate of control it hardly can be
+            the data are not exact then, and it is not estimated: at the rate of control it hardly can be. The
+            simulator's own steps in time are to meet them all the same
         :raises ValueError: no buffer of vectors, no MuJoCo model, actions of another shape than the buffer's or the
             actuators', states that cannot be recovered, NaN, no episode of two transitions, a noise that is negative
             or of another length than the observations

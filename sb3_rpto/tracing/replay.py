@@ -206,7 +206,15 @@ def build(
                 findings.append(Finding("clipped", f"{ALL}, {prefix}.{name}", message))
     columns = replace(columns, missing=repairs.missing)
     known_noise = None if noise is None else state_noise(recover, observations, noise, dt, repairs)
-    return Measurements(episodes, columns, findings + repairs.findings(), repairs.unobserved, exact, noise=known_noise)
+    return Measurements(
+        episodes,
+        columns,
+        findings + repairs.findings(),
+        repairs.unobserved,
+        exact,
+        simulated=known_noise is not None,  # as exact transitions, the environment's own steps are to meet them
+        noise=known_noise,
+    )
 
 
 def state_noise(recover: StateMap, observations: np.ndarray, noise: np.ndarray, dt: float, repairs: _Repairs) -> Noise:

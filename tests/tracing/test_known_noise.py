@@ -73,6 +73,7 @@ def seen(lacks: Sequence[Effect], count: int, noise: np.ndarray = NOISE) -> Repl
 def test_the_noise_of_sines_and_cosines_is_that_of_their_angle() -> None:
     data = Measurements.from_replay(seen([], 60), gym.make(TASK), noise=NOISE)
     assert not data.exact
+    assert data.simulated  # the environment's own steps are to meet them
     assert data.whole_states
     assert data.noise is not None
     np.testing.assert_allclose(data.noise.qpos, 1e-3, rtol=0.03)
