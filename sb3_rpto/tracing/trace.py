@@ -17,7 +17,7 @@ from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE, Adequacy
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.concentrate import NOTHING
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
-from sb3_rpto.tracing.identify import Problem
+from sb3_rpto.tracing.identify import Loss, Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.model_checks import doubts
 from sb3_rpto.tracing.prepare import Progress, SetUp, prepare
@@ -200,7 +200,9 @@ def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 20
             # The mean gradient is not quite zero at a bound; only its scatter matters.
             gradient = linear.gradient[rows].sum(0) - linear.gradient.sum(0) * len(rows) / len(joined)
             moves.append(-np.linalg.solve(linear.normal[rows].sum(0) + ridge, gradient) * problem.size[free])
-        intervals[:, free] = fit.values[free] + widening(len(blocks)) * np.quantile(moves, [0.025, 0.975], axis=0)
+        r = problem.residuals(np.tile(fit.values, (len(joined), 1)), fit.starts, np.arange(len(joined)))
+        wider = widening(len(blocks)) / Loss.of(r).curvature(r)
+        intervals[:, free] = fit.values[free] + wider * np.quantile(moves, [0.025, 0.975], axis=0)
         intervals = np.clip(intervals, problem.lower, problem.upper)
         intervals[:, hidden] = np.nan
     return values, intervals

@@ -356,6 +356,21 @@ def test_the_loss_turns_linear_at_three_typical_residuals_and_three_units_of_noi
     assert Loss(6.0).energy(np.array([[3e4]]), 0 * starts)[0] == pytest.approx(2 * 6.0 * 3e4, rel=1e-3)
 
 
+@pytest.mark.parametrize("tails", [np.inf, 3.0])
+def test_an_estimate_scatters_as_the_curvature_of_the_loss_says(tails: float) -> None:
+    rng, loss = np.random.default_rng(0), Loss(3.0)
+    draws = rng.standard_normal((4_000, 100)) if np.isinf(tails) else rng.standard_t(tails, (4_000, 100))
+    centre = np.zeros((len(draws), 1))
+    for _ in range(40):  # of each row by the loss
+        weight = 1 / np.sqrt(1 + ((draws - centre) / loss.clip) ** 2)
+        centre += (weight * (draws - centre)).sum(axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)
+    r = draws - centre
+    seems = np.sqrt(((weight * r) ** 2).sum(axis=1)) / weight.sum(axis=1)
+    scatter = seems / loss.curvature(r)
+    assert np.sqrt(np.mean(scatter**2)) == pytest.approx(centre.std(), rel=0.03)
+    assert np.sqrt(np.mean(seems**2)) < 0.95 * centre.std()
+
+
 def test_starts_are_recovered() -> None:
     p = problem(true_effects(), recorded(true_effects(), noise=0.0), noise=1e-3)
     w, rng = p.windows, np.random.default_rng(0)
