@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=list(study.METHODS), choices=list(study.METHODS))
     parser.add_argument("--targets", nargs="+", type=int, default=list(study.TARGETS))
     parser.add_argument("--seeds", type=int, default=5, help="how many (default: 5); 0: only write the tables")
+    parser.add_argument("--sensors", type=float, default=0.0, help="noise of the target's positions in rad or m")
     parser.add_argument("--budget", type=int, help="most target steps of a run (default: the study's)")
     parser.add_argument("--no-oracle", action="store_true", help="leave the oracles out")
     parser.add_argument("--workers", type=int, default=2, help="runs side by side")
@@ -53,7 +54,9 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
     # Tables and figure are always of all runs in the folder: "--seeds 0" writes them and runs nothing.
-    todo = [job for job in study.jobs(a.tasks, a.shifts, a.targets, range(a.seeds)) if job.method in a.methods]
+    todo = [
+        job for job in study.jobs(a.tasks, a.shifts, a.targets, range(a.seeds), a.sensors) if job.method in a.methods
+    ]
     for task in dict.fromkeys(job.task for job in todo):
         study.source_agent(task, a.runs)
     with ProcessPoolExecutor(a.workers) as pool:
@@ -76,6 +79,7 @@ def main() -> None:
         "command": "python examples/closed_loop_study.py" + (" --quick" if a.quick else ""),
         "episodes": episodes,
         "budget": a.budget,
+        "sensors": a.sensors,
         "oracle steps": study.ORACLE_STEPS,
         "seeds run": {" ".join(map(str, p)): sorted(set(map(int, r["seed"]))) for p, r in rows.groupby(PLACE)},
         "targets": study.fingerprint(),

@@ -67,6 +67,8 @@ TASKS = {
         300_000,
     ),
 }
+#: Which observations are speeds; what comes after them are forces of constraints, which are shown without noise.
+SPEEDS = {"double-pendulum": slice(5, 8), "hopper": slice(5, 11), "cheetah": slice(8, 17)}
 SHORT, LONG = (250, 500, 1_000, 2_000), (250, 500, 1_000, 2_000, 5_000, 10_000, 20_000)
 ORACLE_STEPS = 100_000
 PHYSICAL = {"dynamics": "physical"}
@@ -83,21 +85,30 @@ METHODS: dict[str, tuple[str, tuple[int, ...], dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Job:
-    """One run."""
+    """One run.
+
+    :param sensors: standard deviation of the noise with which the target's positions are observed, in rad or m, and ten
+        times as many rad/s or m/s of the speeds; a closed loop is told
+    """
 
     task: str
     shift: str
     target: int
     method: str
     seed: int
+    sensors: float = 0.0
 
     @property
     def name(self) -> str:
         """Of its result file."""
-        return "_".join(map(str, asdict(self).values())).replace(" ", "-").replace(",", "")
+        place = (self.task, self.shift, self.target, self.method, self.seed)
+        told = (*place, f"sensors-{self.sensors:g}") if self.sensors else place
+        return "_".join(map(str, told)).replace(" ", "-").replace(",", "")
 
 
-def jobs(tasks: Sequence[str], shifts: Sequence[str], targets: Sequence[int], seeds: Sequence[int]) -> list[Job]:
+def jobs(
+    tasks: Sequence[str], shifts: Sequence[str], targets: Sequence[int], seeds: Sequence[int], sensors: float = 0.0
+) -> list[Job]:
     """All runs, seed by seed, so that an unfinished study is a fair sample.
 
     :raises ValueError: an unknown task or shift
@@ -106,7 +117,8 @@ def jobs(tasks: Sequence[str], shifts: Sequence[str], targets: Sequence[int], se
         unknown = set(given) - set(known)
         if unknown:
             raise ValueError(f"{name}: {sorted(unknown)} do not exist; choose from {known}")
-    return [Job(*place, m, seed) for seed in seeds for place in product(tasks, shifts, targets) for m in METHODS]
+    places = product(seeds, tasks, shifts, targets, METHODS)
+    return [Job(task, shift, target, method, seed, sensors) for seed, task, shift, target, method in places]
 
 
 def shifted(task: str, shift: str, target: int) -> list[Effect]:
@@ -140,11 +152,29 @@ def make_source(task: str) -> gym.Env:
     return gym.make(TASKS[task].env_id)
 
 
-def make_target(task: str, shift: str, target: int) -> gym.Env:
-    """A target of a task."""
+def make_target(task: str, shift: str, target: int, sensors: float = 0.0, seed: int = 0) -> gym.Env:
+    """A target of a task, observed with noise as of :class:`Job` that follows from a seed."""
     source = make_source(task)
     effects = shifted(task, shift, target)
-    return apply_effects(source, effects) if effects else source
+    made = apply_effects(source, effects) if effects else source
+    return noisy(made, sensor_noise(task, made, sensors), seed) if sensors else made
+
+
+def sensor_noise(task: str, env: gym.Env, sensors: float) -> np.ndarray:
+    """Standard deviation of each observation's noise, (d,), from that of positions."""
+    assert env.observation_space.shape is not None
+    speeds, noise = SPEEDS[task], np.full(env.observation_space.shape, sensors)
+    noise[speeds] *= 10
+    noise[speeds.stop :] = 0
+    return noise
+
+
+def noisy(env: gym.Env, noise: np.ndarray, seed: int) -> gym.Env:
+    """The environment behind sensors with white noise of this standard deviation, (d,)."""
+    rng = np.random.default_rng(seed)
+    return gym.wrappers.TransformObservation(
+        env, lambda observation: observation + noise * rng.standard_normal(noise.shape), env.observation_space
+    )
 
 
 @cache
@@ -169,12 +199,15 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
     method, points, settings = METHODS[job.method]
     points = tuple(p for p in points if budget is None or p <= budget) or ((budget,) if points and budget else ())
     agent, data = source_agent(job.task, folder)
-    target = partial(make_target, job.task, job.shift, job.target)
+    target = partial(make_target, job.task, job.shift, job.target, job.sensors, job.seed)
     kwargs: dict[str, Any] = dict(settings)
     if method == "rpto":
         kwargs["source_data"] = data
         if kwargs["dynamics"] == "physical":
             kwargs["declared"] = list(TASKS[job.task].declared)
+        if job.sensors and "close_loop" in kwargs:
+            noise = sensor_noise(job.task, make_source(job.task), job.sensors)
+            kwargs["dynamics_kwargs"] = {"observation_noise": noise.tolist()}
     truth = {e.label: float(e.values[0]) for e in shifted(job.task, job.shift, job.target) if isinstance(e, Declared)}
     rows = transfer(
         method,

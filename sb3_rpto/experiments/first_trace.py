@@ -15,15 +15,22 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto.algorithms.closing import FIRST, window
 from sb3_rpto.effects import Declared
-from sb3_rpto.experiments.closed_loop import SHIFTS, TASKS, make_source, make_target, shifted, source_agent
+from sb3_rpto.experiments.closed_loop import (
+    SHIFTS,
+    TASKS,
+    make_source,
+    make_target,
+    noisy,
+    sensor_noise,
+    shifted,
+    source_agent,
+)
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.columns import columns_of
 from sb3_rpto.tracing.report import write_atomically
 
 #: A noisy log: runs, steps of the policy in each, and the longest time between two samples in s.
 RUNS, STEPS, SAMPLED = 10, 100, 0.01
-#: Which observations are speeds; what comes after them are forces of constraints, which are shown without noise.
-SPEEDS = {"double-pendulum": slice(5, 8), "hopper": slice(5, 11), "cheetah": slice(8, 17)}
 #: A shift of the declared numbers, and a cause outside of the library: gusts of so many N on the first coordinate,
 #: a sine of so many Hz, whose phase nobody records.
 GUSTS, FORCE, FREQUENCY = "gusts", 20.0, 1.0
@@ -98,7 +105,7 @@ def first_transitions(job: Job, folder: Path) -> Measurements:
     target: gym.Env = make_target(job.task, "declared" if job.shift == GUSTS else job.shift, job.target)
     if job.shift == GUSTS:
         target = Gusts(target, job.seed)
-    noise = sensor_noise(job, target) if job.sensors else None
+    noise = sensor_noise(job.task, target, job.sensors) if job.sensors else None
     if noise is not None:
         target = noisy(target, noise, job.seed)
     target = Monitor(target)
@@ -106,24 +113,6 @@ def first_transitions(job: Job, folder: Path) -> Measurements:
     sac.learn(FIRST)  # collects, without an update
     assert sac.replay_buffer is not None
     return Measurements.from_replay(sac.replay_buffer, make_source(job.task), noise=noise)
-
-
-def sensor_noise(job: Job, env: gym.Env) -> np.ndarray:
-    """Standard deviation of each observation, (d,)."""
-    assert env.observation_space.shape is not None
-    speeds = SPEEDS[job.task]
-    noise = np.full(env.observation_space.shape, job.sensors)
-    noise[speeds] *= 10
-    noise[speeds.stop :] = 0
-    return noise
-
-
-def noisy(env: gym.Env, noise: np.ndarray, seed: int) -> gym.Env:
-    """The environment behind sensors with white noise of this standard deviation, (d,)."""
-    rng = np.random.default_rng(seed)
-    return gym.wrappers.TransformObservation(
-        env, lambda observation: observation + noise * rng.standard_normal(noise.shape), env.observation_space
-    )
 
 
 def noisy_log(job: Job, folder: Path) -> Measurements:

@@ -100,6 +100,26 @@ def test_steps_to_a_share_of_the_oracle() -> None:
     assert study.steps_to(rows(), {("hopper", "none", 1): 1.0}).empty, "of an unknown oracle nothing is said"
 
 
+def test_noisy_sensors_are_those_of_the_target_and_the_loop_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = []
+    monkeypatch.setattr(study, "source_agent", lambda *_: ("agent", None))
+    monkeypatch.setattr(study, "transfer", lambda *args, **kwargs: told.append((args[3], kwargs)) or [])
+    for method in ("SAC-warm", "RPTO-physical, open loop", "RPTO-physical, closed loop"):
+        study.run(study.Job("double-pendulum", "none", 0, method, 0, sensors=1e-3), tmp_path)
+    noise = np.array([1e-3] * 5 + [1e-2] * 3 + [0.0])
+    for target, _ in told:
+        shown, exact = (env.reset(seed=0)[0] for env in (target(), study.make_target("double-pendulum", "none", 0)))
+        assert (np.abs(shown - exact)[:8] > 0).all()
+        assert (np.abs(shown - exact) < 5 * noise + 1e-12).all()
+    passed = [kwargs.get("dynamics_kwargs") for _, kwargs in told]
+    assert passed[:2] == [None, None]
+    np.testing.assert_allclose(passed[2]["observation_noise"], noise)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert "double-pendulum_none_0_SAC-warm_0_sensors-0.001.json" in names
+
+
 def test_finished_runs_are_not_repeated_and_are_collected(tmp_path: Path) -> None:
     job = study.Job("double-pendulum", "none", 0, "zero-shot", 0)
     path = tmp_path / f"{job.name}.json"
