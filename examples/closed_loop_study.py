@@ -41,15 +41,16 @@ def main() -> None:
     parser.add_argument("--budget", type=int, help="most target steps of a run (default: the study's)")
     parser.add_argument("--no-oracle", action="store_true", help="leave the oracles out")
     parser.add_argument("--workers", type=int, default=2, help="runs side by side")
-    parser.add_argument("--runs", type=Path, default=Path("runs/closed_loop"), help="where single runs are kept")
+    parser.add_argument("--runs", type=Path, help="where single runs are kept (runs/closed_loop)")
     parser.add_argument("--out", type=Path, help="where the tables go")
     a = parser.parse_args()
-    episodes = study.EPISODES
+    name = f"closed_loop_sensors_{a.sensors:g}" if a.sensors else "closed_loop"
+    a.runs, episodes = a.runs or Path("runs") / name, study.EPISODES
     if a.quick:
         a.tasks, a.shifts, a.targets, a.seeds, a.no_oracle = ["double-pendulum"], ["undeclared"], [0], 1, True
         a.methods, a.runs, episodes = ["zero-shot", "RPTO-physical, closed loop"], a.runs / "quick", 2
         a.budget = a.budget or 260
-    out = a.out or (a.runs if a.quick else Path(__file__).parent / "results" / "closed_loop")
+    out = a.out or (a.runs if a.quick else Path(__file__).parent / "results" / name)
     for folder in (a.runs, out):
         folder.mkdir(parents=True, exist_ok=True)
 

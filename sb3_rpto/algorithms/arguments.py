@@ -169,7 +169,12 @@ def check_something_to_fit(
     if config.get("observation_noise") is not None and (close_loop is False or traces_log):
         raise ValueError(
             "dynamics_kwargs['observation_noise'] is for traces of a closed loop on transitions of the target; leave "
-            f"it out{': the noise of recordings is estimated' if traces_log else ', or pass close_loop=True'}"
+            "it out, "
+            + (
+                "recordings tell their own: Measurements.from_replay(..., noise=...) where it is known"
+                if traces_log
+                else "or pass dynamics='physical' and close_loop=True on a MuJoCo env"
+            )
         )
     if mujoco and "rollout_start" in passed:
         raise ValueError(

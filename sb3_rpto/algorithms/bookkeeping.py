@@ -153,7 +153,7 @@ class TwoWorlds(PolicySnapshots):
             check_machine(source, target)
 
     def _keeps_phi(self) -> bool:
-        return self.loop is not None and self.loop.keeps_phi(self.dynamics)
+        return self.loop is not None and self.loop.keeps_phi
 
     def _doubt_the_target(self, error: float) -> None:
         """Warn, after the first fit (with the loop closed: after the first trace), where the simulator does not fit."""
@@ -161,7 +161,8 @@ class TwoWorlds(PolicySnapshots):
         if self._judged_target or (self.loop is not None and not self.loop.found):
             return
         self._judged_target = True
-        found = doubts(self.dynamics, error)
+        noisy = self.loop is not None and self.loop.keeps_phi
+        found = doubts(self.dynamics, 0.0 if noisy else error)  # which is mostly noise there
         if found:
             warnings.warn(
                 f"after the fit {' and '.join(found)}: do the target's observations hold the model's joints in its "

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.source import EpisodeSource
-from sb3_rpto.dynamics.base import Dynamics, Transitions
+from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Declared, from_json
 from sb3_rpto.envs.observations import single_env
@@ -36,6 +36,8 @@ WINDOW = 4
 #: What is missing grows with the square of the time, noise does not: where there is some, windows may have so many,
 #: as long as three of four episodes hold them.
 NOISY_WINDOW, SHORT_EPISODES = 6, 0.25
+#: So many transitions fill all windows of a trace: up to there more of noisy ones tell more.
+ENOUGH = 400
 #: What is found is kept when the one-step error falls below this share of the best without it.
 WORTH = 0.9
 #: Source steps that fill D_source anew.
@@ -68,6 +70,8 @@ class LoopCloser:
         self._error = math.inf
         #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
         self.stale = False
+        #: whether phi is what a trace of noisy transitions made it
+        self.keeps_phi = False
         #: whether the last trace accounts for the target, so that the simulator may judge policies
         self.accounts = False
         #: of the policy in the simulator as it is fitted
@@ -78,7 +82,8 @@ class LoopCloser:
 
     def forget_target(self) -> None:
         """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""
-        self._traced_at, self._error, self.accounts, self.rehearsals = None, math.inf, False, Rehearsals()
+        self._traced_at, self._error, self.rehearsals = None, math.inf, Rehearsals()
+        self.accounts = self.keeps_phi = False
 
     def due(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
         """Whether enough was seen for a first trace, for a better one than the last, or is no longer predicted."""
@@ -91,14 +96,11 @@ class LoopCloser:
         new = min(buffer.target_added - self._traced_at, size)
         if new < min(AGAIN, capacity):
             return False
-        if self.found[-1]["verdict"] not in SETTLED and buffer.target_added >= MORE * self._traced_at:
+        more = buffer.target_added >= MORE * self._traced_at
+        blurred = dynamics.observation_noise is not None and self._traced_at < ENOUGH
+        if more and (blurred or self.found[-1]["verdict"] not in SETTLED):
             return True
         return dynamics.error(model.transitions("target").take(slice(size - new, None))) > RISEN * self._error
-
-    def keeps_phi(self, dynamics: Dynamics | None) -> bool:
-        """Whether phi stays what the last trace found: one-step fits to noisy transitions would spoil it."""
-        noisy = isinstance(dynamics, PhysicalDynamics) and dynamics.observation_noise is not None
-        return noisy and self._traced_at is not None
 
     def close(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:
         """Trace on D_target, keep what lowers the error, log it, and renew D_source where another simulator made it.
@@ -219,6 +221,7 @@ class LoopCloser:
         if before < math.inf and not dynamics.error(data) < (WORTH if new else 1.0) * before:
             dynamics.replace(*kept)
             return []
+        self.keeps_phi = dynamics.observation_noise is not None
         assert model.dynamics_config is not None
         model.dynamics_config["effects"] = dynamics.added()  # what a checkpoint rebuilds the model from
         return new
@@ -258,11 +261,13 @@ def _say(model: TransferAlgorithm, report: Report, added: list[str], data: str, 
     if model.verbose:
         print(f"traced on {data}: {report.verdict}; {', '.join(added) or 'nothing'} added")
     if report.verdict == "unexplained":
+        known = model.measured is not None or model.dynamics_kwargs.get("observation_noise") is not None
+        noise = "" if known else "whether they are noisy (dynamics_kwargs={'observation_noise': ...}), "
         warnings.warn(
             f"the trace on {data} is 'unexplained': what it looked for does not account for the difference, and the "
             "policy learns in a simulator that still errs; see print(model.loop.reports[-1]) for which joints, and "
-            "whether the observations hold the model's joints in its order, whether they are noisy "
-            "(dynamics_kwargs={'observation_noise': ...}), what else could be declared, and dynamics='residual'",
+            f"whether the observations hold the model's joints in its order, {noise}what else could be declared, and "
+            "dynamics='residual'",
             stacklevel=3,
         )
 

@@ -127,12 +127,14 @@ class _Log:
         """
         time, ctrl = episode.time, episode.ctrl[:, self.order]
         # Cubics that lean to one side are too rough at the ends.
-        reach = 0 if self.measured.exact else max(HALF_COUNT, round(HALF_WIDTH / float(np.median(np.diff(time)))))
+        reach = (
+            0 if self.measured.whole_states else max(HALF_COUNT, round(HALF_WIDTH / float(np.median(np.diff(time)))))
+        )
         nodes = self._nodes(time, ctrl, reach)
         if not len(nodes):
             return np.empty((0, self.model.nq)), np.empty((0, self.model.nv)), np.empty((0, self.model.nu)), np.empty(0)
         edges = np.concatenate([nodes[:1] - self.dt, nodes])
-        lead = 0.0 if self.measured.exact else half_step(self.model)
+        lead = 0.0 if self.measured.exact or self.measured.simulated else half_step(self.model)
         commands = held(time, ctrl, edges - lead)
         qpos, qvel = self._states(episode, nodes)
         bad = ~(episode.usable & episode.enabled.all(axis=1))

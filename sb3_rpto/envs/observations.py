@@ -90,18 +90,31 @@ def register_state_map(env: str | type[gym.Env], make: Callable[[gym.Env], Recov
     _registered[env] = make
 
 
-def noise_of_each(noise: float | Sequence[float] | np.ndarray, width: int) -> np.ndarray:
+def noise_of_each(noise: float | Sequence[float] | np.ndarray, recover: StateMap) -> np.ndarray:
     """Standard deviation of each observation's noise, (width,), from one for each or for all.
 
-    :raises ValueError: of another shape, negative or not finite, or no noise at all
+    :param recover: the observations' map
+    :raises ValueError: of another shape, no numbers, negative or not finite, or no noise at all; observations that do
+        not hold all velocities, without which a noisy sample is no state
     """
-    given = np.asarray(noise, dtype=float)
-    if given.shape not in ((), (width,)) or not (np.isfinite(given).all() and (given >= 0).all() and given.any()):
+    try:
+        given = np.asarray(noise, dtype=float)
+    except (TypeError, ValueError):
+        given = np.array(np.nan)
+    fits = given.shape in ((), (recover.width,)) and not isinstance(noise, bool)
+    if not fits or not (np.isfinite(given).all() and (given >= 0).all() and given.any()):
         raise ValueError(
             f"the noise of the observations is {noise!r}; give a standard deviation above 0, or one for each of the "
-            f"{width} observations, in their units; leave it out for observations without noise"
+            f"{recover.width} observations, in their units; leave it out for observations without noise"
         )
-    return np.broadcast_to(given, (width,)).copy()
+    with np.errstate(all="ignore"):
+        shown = recover(np.zeros((1, recover.width))).known_qvel[0]
+    if not shown.all():
+        raise ValueError(
+            f"a noise of the observations was given, but those of {recover.env_name} do not hold the velocities of "
+            f"all joints ({int((~shown).sum())} of {len(shown)} are missing): leave it out, or observe them"
+        )
+    return np.broadcast_to(given, (recover.width,)).copy()
 
 
 def single_env(env: gym.Env | VecEnv) -> gym.Env:

@@ -95,7 +95,7 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
         report = trace(source, data, TASKS[job.task].declared, seed=job.seed, horizon=horizon, threads=1)
         row = {**asdict(job), **judged(job, report), "seconds": round(time.perf_counter() - began, 1)}
         write_atomically(path, json.dumps(row, indent=1) + "\n")
-    return dict(json.loads(path.read_text()))
+    return {**asdict(job), **json.loads(path.read_text())}
 
 
 def first_transitions(job: Job, folder: Path) -> Measurements:
@@ -155,10 +155,9 @@ def judged(job: Job, report: Report) -> dict[str, Any]:
     values = {t.effect.label: float(t.effect.values[0]) for t in report.declared}
     nominal = {d.label: float(d.parameters[0].null) for d in (t.effect for t in report.declared)}
     off = {label: abs(value / truth.get(label, nominal[label]) - 1) for label, value in values.items()}
-    told = [t for t in (*report.declared, *report.effects) if t.effect.label in {*truth, *nominal}]
-    held = [
-        t.interval[0, 0] <= truth.get(t.effect.label, nominal.get(t.effect.label)) <= t.interval[1, 0] for t in told
-    ]
+    true = nominal | truth
+    shown = [(true[t.label], t.interval[:, 0]) for t in (*report.declared, *report.effects) if t.label in true]
+    held = [low <= value <= high for value, (low, high) in shown if low <= high]
     return {
         "verdict": report.verdict,
         "R_before": report.adequacy_before.ratio,

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from sb3_rpto.tracing.identify import Fit, Problem
+from sb3_rpto.tracing.identify import Fit
 from sb3_rpto.tracing.select import LIKELY, TRIED, Selection, Selector
 
 #: t* is this quantile of the thresholds that complete sets need.
@@ -16,7 +14,7 @@ LEVEL = 0.95
 def calibrated(selector: Selector, base: Fit, chosen: list[int], sets: int, seed: int) -> float:
     """t*: the threshold that names no effect in 95 % of complete sets, at least that of a single test.
 
-    Each set is simulated from the fitted declared model in the windows at hand, with the estimated noise; all chosen
+    Each set is simulated from the fitted declared model in the windows at hand, with the noise of the data; all chosen
     candidates are fitted to it and then eliminated to the last.
 
     :param selector: with the windows
@@ -31,8 +29,8 @@ def calibrated(selector: Selector, base: Fit, chosen: list[int], sets: int, seed
 def needed(selector: Selector, base: Fit, chosen: list[int], seed: int) -> float:
     """The least threshold that names nothing on one complete set, see :func:`strongest`."""
     rng = np.random.default_rng(seed)
-    train = complete(selector.train, base, rng)
-    select = None if selector.select is None else complete(selector.select, selector.select.score(base.values), rng)
+    train = selector.train.redrawn(base, rng)
+    select = None if selector.select is None else selector.select.redrawn(selector.select.score(base.values), rng)
     return strongest(Selector(train, select, selector.threshold, selector.say, selector.horizon), base, chosen)
 
 
@@ -54,12 +52,3 @@ def strongest(selector: Selector, base: Fit, chosen: list[int]) -> float:
         level = min(selector.evidence(current, selector.model(rest, current.fit)).t for rest in rests)
         outcome = selector.eliminate(outcome, level)
     return level
-
-
-def complete(problem: Problem, fit: Fit, rng: np.random.Generator) -> Problem:
-    """The same windows as the model itself would have been measured."""
-    w = problem.windows
-    values = np.tile(fit.values, (len(w), 1))
-    true = problem.predict(values, fit.starts, np.arange(len(w)))
-    measured = np.where(np.isfinite(true), true, w.measured) + rng.standard_normal(true.shape) * w.sigma
-    return Problem(problem.simulation, replace(w, measured=measured), problem.scales)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.tracing.box import bounded_step
+from sb3_rpto.tracing.interpolation import interpolate
 from sb3_rpto.tracing.starts import moved, straight
 from sb3_rpto.tracing.windows import Windows
 
@@ -382,8 +383,24 @@ class Problem:
             best = np.where(better[:, None], now, r)
         return Fit(values, starts, self.errors(best), float(Loss.of(best).energy(best, starts).sum()))
 
+    def redrawn(self, fit: Fit, rng: np.random.Generator) -> Problem:
+        """The same windows as the model itself would have been measured; starts that are samples get noise, too."""
+        w, every, nv = self.windows, np.arange(len(self.windows)), self.simulation.model.nv
+        true = self.predict(np.tile(fit.values, (len(w), 1)), fit.starts, every)
+        measured = np.where(np.isfinite(true), true, w.measured) + rng.standard_normal(true.shape) * w.sigma
+        if w.noisy_starts:
+            off = (fit.starts + rng.standard_normal(fit.starts.shape)) * w.spread * w.trust
+            w = replace(w, qpos=moved(self.simulation.model, w.qpos, off[:, :nv]), qvel=w.qvel + off[:, nv:])
+        return Problem(self.simulation, replace(w, measured=measured), self.scales)
+
     def noise_errors(self, fit: Fit, seed: int, draws: int = 8) -> np.ndarray:
-        """Errors that a true model would have: white noise, less what the fitted starts take of it, (draws, W)."""
+        """Errors that a true model would have: white noise, less what the fitted starts take of it, (draws, W).
+
+        Noisy starts may lie across a contact: their draws are simulated, where smoothed ones leave a slope to go by.
+        """
+        if self.windows.noisy_starts:
+            generators = np.random.default_rng(seed).spawn(draws)
+            return np.array([self.redrawn(fit, rng).score(fit.values).errors for rng in generators])
         _, _, jx = self.linearise(fit.values, fit.starts, np.empty(0, dtype=int))
         w = self.windows
         rng = np.random.default_rng(seed)
@@ -392,8 +409,6 @@ class Problem:
         for _ in range(draws):
             r = rng.standard_normal(mask.shape) * mask
             if jx.shape[2]:
-                if w.noisy_starts:
-                    r -= np.einsum("wrx,wx->wr", jx, rng.standard_normal((len(r), jx.shape[2])))
                 hxx = np.einsum("wrx,wry->wxy", jx, jx) + np.eye(jx.shape[2])
                 move = np.linalg.solve(hxx, np.einsum("wrx,wr->wx", jx, r)[:, :, None])[:, :, 0]
                 r = r - np.einsum("wrx,wx->wr", jx, move)
@@ -417,31 +432,3 @@ class _Step:
     residuals: np.ndarray  # (W, R)
     cost: float
     damping: float
-
-
-def interpolate(
-    q: np.ndarray, v: np.ndarray, at: np.ndarray, dt: float, columns: np.ndarray, dofs: np.ndarray
-) -> np.ndarray:
-    """Positions at fractional steps by cubic Hermite interpolation, before the start in a straight line, (n, S, m).
-
-    :param q: (n, K + 1, nq)
-    :param v: (n, K + 1, nv)
-    :param at: (n, S)
-    :param dt: length of a step in s
-    :param columns: addresses in q, (m,)
-    :param dofs: addresses in v, -1 for a coordinate that is interpolated linearly, (m,)
-    """
-    past, at = np.minimum(at, 0.0), np.maximum(at, 0.0)
-    if past.any():
-        straight = np.where(dofs >= 0, dt * v[:, 0][:, dofs], 0.0)[:, None]
-        return interpolate(q, v, at, dt, columns, dofs) + past[:, :, None] * straight
-    k = np.minimum(at.astype(int), q.shape[1] - 2)
-    s = (at - k)[:, :, None]
-    rows = np.arange(len(q))[:, None]
-    q0, q1 = q[rows, k][:, :, columns], q[rows, k + 1][:, :, columns]
-    if not np.any(s % 1):
-        return np.where(s == 0, q0, q1)
-    slope = q1 - q0
-    d0 = np.where(dofs >= 0, dt * v[rows, k][:, :, dofs], slope)
-    d1 = np.where(dofs >= 0, dt * v[rows, k + 1][:, :, dofs], slope)
-    return q0 + s * (d0 + s * ((3 * slope - 2 * d0 - d1) + s * (d0 + d1 - 2 * slope)))

@@ -176,7 +176,7 @@ def _sampling(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
             f"one of {step / max(1, np.ceil(step / timestep)):.6g} s would be"
         )
         found.append(Finding("sampling", f"{ALL}, time", message))
-    if not data.exact and stiff(discretised(model, data, fine=False)):
+    if not (data.exact or data.simulated) and stiff(discretised(model, data, fine=False)):
         message = "too stiff for the Runge-Kutta method at this timestep: integrated implicitly, less finely"
         found.append(Finding("stiff model", "the model", message))
     if step > 1.01 * SLOW and not data.exact:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
@@ -28,10 +29,13 @@ from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.columns import Columns, columns_of, joint_of
 from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.measurements import Measurements, Noise
+from sb3_rpto.tracing.starts import turning
 
 MIN_TRANSITIONS = 2
 #: Draws from which the noise of states follows from that of observations.
 DRAWS = 10_000
+#: A speed that lies within so many standard deviations of its observation's bound may be beyond it.
+BEYOND = 4.0
 ALL = "all episodes"
 
 
@@ -52,6 +56,8 @@ def from_replay(
     """See :meth:`sb3_rpto.tracing.Measurements.from_replay`."""
     env = single_env(env)
     mujoco_model(env)
+    if noise is not None:
+        noise = noise_of_each(noise, state_map(env))
     side = buffer.target if isinstance(buffer, DualReplayBuffer) else buffer
     if not isinstance(side, ReplayBuffer) or isinstance(side, DictReplayBuffer):
         raise ValueError(f"buffer must be an SB3 ReplayBuffer of vector observations, not {type(buffer).__name__}")
@@ -77,8 +83,6 @@ def from_replay(
     if broken:
         message = f"{broken} time(s) a transition does not begin where one before it ended; cut there"
         findings.append(Finding("gap", ALL, message))
-    if noise is not None:
-        noise = noise_of_each(noise, int(np.prod(side.obs_shape)))
     return build(runs, env, exact and noise is None, findings, noise)
 
 
@@ -174,6 +178,9 @@ def build(
     actions = _commands(np.concatenate([run.actions for run in kept]), env, findings)
     observations = np.concatenate([run.observations for run in kept])
     states = recover(observations)
+    known_noise = None
+    if noise is not None:
+        states, known_noise = behind_noise(model, recover, observations, noise)
     repairs = _Repairs(columns, states, env_name(env))
     known = np.ones(len(states.qpos), dtype=bool)
     for flags, seen in ((states.known_qpos, repairs.seen_qpos), (states.known_qvel, repairs.seen_qvel)):
@@ -205,7 +212,6 @@ def build(
                 message = f"unknown in {(~flags[:, i]).sum()} of {len(flags)} samples, which are not usable"
                 findings.append(Finding("clipped", f"{ALL}, {prefix}.{name}", message))
     columns = replace(columns, missing=repairs.missing)
-    known_noise = None if noise is None else state_noise(recover, observations, noise, dt, repairs)
     return Measurements(
         episodes,
         columns,
@@ -217,29 +223,39 @@ def build(
     )
 
 
-def state_noise(recover: StateMap, observations: np.ndarray, noise: np.ndarray, dt: float, repairs: _Repairs) -> Noise:
-    """Noise of the states behind noisy observations, by draws of it; none where no observation tells of one.
+def behind_noise(
+    model: mujoco.MjModel, recover: StateMap, observations: np.ndarray, noise: np.ndarray
+) -> tuple[States, Noise]:
+    """States behind noisy observations, and their noise by draws of it: none where no observation tells of one.
 
+    A speed at its bound shows as one beside it: what could be beyond is not known.
+
+    :param model: whose quaternions are of unit length
     :param recover: states from observations
     :param observations: (n, d)
-    :param noise: of each, (d,)
-    :param dt: time between two of them in s
-    :param repairs: knows which velocities are differences of positions
+    :param noise: standard deviation of each, (d,)
     """
-    rng = np.random.default_rng(0)
     rows = np.resize(np.arange(len(observations)), DRAWS)
-    shown, drawn = (
-        recover(o) for o in (observations[rows], observations[rows] + noise * rng.standard_normal((DRAWS, len(noise))))
-    )
-    turns = drawn.qpos - shown.qpos
-    wrapped = list(shown.wrapped)
+    shaken = noise * np.random.default_rng(0).standard_normal((DRAWS, len(noise)))
+    states, drawn = (_of_unit_length(model, recover(o)) for o in (observations, observations[rows] + shaken))
+    for far in (-BEYOND, BEYOND):
+        away = recover(observations + far * noise)
+        states = states._replace(
+            known_qpos=states.known_qpos & away.known_qpos, known_qvel=states.known_qvel & away.known_qvel
+        )
+    turns, wrapped = drawn.qpos - states.qpos[rows], list(states.wrapped)
     turns[:, wrapped] = (turns[:, wrapped] + np.pi) % (2 * np.pi) - np.pi
-    qpos = _scatter(turns, shown.known_qpos & drawn.known_qpos)
-    qvel = _scatter(drawn.qvel - shown.qvel, shown.known_qvel & drawn.known_qvel)
-    for name in repairs.missing:
-        i = repairs.columns.qvel.index(name)
-        qvel[i] = qpos[repairs.columns.qpos.index(name)] / (np.sqrt(2) * dt)
-    return Noise(qpos, qvel)
+    both = (states.known_qpos[rows] & drawn.known_qpos), (states.known_qvel[rows] & drawn.known_qvel)
+    return states, Noise(_scatter(turns, both[0]), _scatter(drawn.qvel - states.qvel[rows], both[1]))
+
+
+def _of_unit_length(model: mujoco.MjModel, states: States) -> States:
+    """The states with the quaternions of their ball and free joints of length one."""
+    qpos = states.qpos.copy()
+    for address in turning(model):
+        columns = slice(address, address + 4)
+        qpos[:, columns] /= np.linalg.norm(qpos[:, columns], axis=1, keepdims=True)
+    return states._replace(qpos=qpos)
 
 
 def _scatter(moved: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -201,6 +201,7 @@ def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 20
             gradient = linear.gradient[rows].sum(0) - linear.gradient.sum(0) * len(rows) / len(joined)
             moves.append(-np.linalg.solve(linear.normal[rows].sum(0) + ridge, gradient) * problem.size[free])
         r = problem.residuals(np.tile(fit.values, (len(joined), 1)), fit.starts, np.arange(len(joined)))
+        r = r[np.repeat(joined.usable, joined.measured.shape[2], axis=1)]
         wider = widening(len(blocks)) / Loss.of(r).curvature(r)
         intervals[:, free] = fit.values[free] + wider * np.quantile(moves, [0.025, 0.975], axis=0)
         intervals = np.clip(intervals, problem.lower, problem.upper)

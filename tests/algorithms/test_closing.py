@@ -165,10 +165,40 @@ def test_phi_stays_what_a_trace_found_where_sensors_are_noisy() -> None:
     assert made.loop is not None
     (report,) = made.loop.reports
     traced = np.concatenate([t.effect.values for t in (*report.declared, *report.effects)])
+    made._since_fit = made.model_train_freq
     made.fit_dynamics()
     np.testing.assert_array_equal(dynamics(made).values, traced)
-    made.loop.forget_target()  # of another target nothing is known
-    assert not made.loop.keeps_phi(made.dynamics)
+
+
+def test_of_another_target_nothing_is_kept() -> None:
+    loop = LoopCloser(())
+    loop.keeps_phi = True
+    loop.forget_target()
+    assert not loop.keeps_phi
+
+
+def test_phi_goes_on_being_fitted_where_what_was_traced_is_refused(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = filled(friction(), dynamics_kwargs={"observation_noise": 1e-4})
+    assert made.loop is not None
+    monkeypatch.setattr(closing, "stays_finite", lambda *_: False)
+    with pytest.warns(UserWarning, match="unstable: refused"):
+        made.loop.close(made, dynamics(made))
+    assert not made.loop.keeps_phi
+
+
+@pytest.mark.parametrize(("noise", "traced_at", "due"), [(1e-3, 200, True), (1e-3, 400, False), (None, 200, False)])
+def test_noisy_transitions_are_traced_once_more_when_they_fill_all_windows(
+    noise: float | None, traced_at: int, due: bool
+) -> None:
+    loop = LoopCloser(())
+    loop._traced_at, loop.found, loop._error = traced_at, [{"verdict": "complete"}], 1.0
+    seen = SimpleNamespace(size=lambda: 2 * traced_at, buffer_size=10_000)
+    made = SimpleNamespace(
+        replay_buffer=SimpleNamespace(target=seen, target_added=2 * traced_at),
+        transitions=lambda _: SimpleNamespace(take=lambda rows: rows),
+    )
+    phi = SimpleNamespace(observation_noise=noise, error=lambda _: 1.0)
+    assert loop.due(made, phi) is due  # type: ignore[arg-type]
 
 
 def test_a_checkpoint_knows_the_noise(tmp_path: Path) -> None:
@@ -460,6 +490,7 @@ def test_long_names_of_effects_are_logged(soon: None) -> None:
         ({"dynamics_kwargs": {"observation_noise": 1e-3}, "close_loop": False}, "or pass close_loop=True"),
         ({"dynamics_kwargs": {"observation_noise": -1e-3}}, "standard deviation above 0"),
         ({"dynamics_kwargs": {"observation_noise": [1e-3] * 5}}, "each of the 9 observations"),
+        ({"dynamics_kwargs": {"observation_noise": "much"}}, "'much'; give a standard deviation"),
     ],
 )
 def test_what_cannot_be_closed_is_refused(settings: dict[str, object], said: str) -> None:

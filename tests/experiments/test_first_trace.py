@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -76,4 +77,5 @@ def test_a_trace_is_compared_with_the_truth_and_made_once(
     assert row["verdict"] == ("explained" if named else "complete")
     assert row["declared_error_max"] < 1e-4
     (folder / "trace_double-pendulum_undeclared_7_0.json").write_text('{"verdict": "kept"}')
-    assert run(Job("double-pendulum", "undeclared", 7), folder) == {"verdict": "kept"}
+    job = Job("double-pendulum", "undeclared", 7)
+    assert run(job, folder) == {**asdict(job), "verdict": "kept"}

@@ -7,7 +7,7 @@ from simulated import problem, recorded
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.tracing import calibrate
-from sb3_rpto.tracing.calibrate import calibrated, complete, needed
+from sb3_rpto.tracing.calibrate import calibrated, needed
 from sb3_rpto.tracing.select import LIKELY, Selector
 
 
@@ -40,7 +40,7 @@ def test_the_threshold_is_a_quantile_of_the_sets_and_no_less_than_that_of_a_test
 def test_a_complete_set_is_the_models_own_motion_with_the_estimated_noise() -> None:
     s = selector(0.08)
     base = s.model((), s.train.score(s.train.null)).fit
-    one, other = (complete(s.train, base, np.random.default_rng(seed)).windows for seed in (0, 1))
+    one, other = (s.train.redrawn(base, np.random.default_rng(seed)).windows for seed in (0, 1))
     own = s.train.predict(np.tile(base.values, (len(one), 1)), base.starts, np.arange(len(one)))
     noise = np.stack([(w.measured - own) / w.sigma for w in (one, other)])
     assert noise.std(axis=(1, 2, 3)) == pytest.approx([1.0, 1.0], abs=0.1)

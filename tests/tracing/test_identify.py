@@ -19,7 +19,8 @@ from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.effects.sensors import SensorBias, SensorDelay, SensorGain
 from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.box import bounded_step
-from sb3_rpto.tracing.identify import RIDGE, UNSTABLE, Loss, Problem, interpolate
+from sb3_rpto.tracing.identify import RIDGE, UNSTABLE, Loss, Problem
+from sb3_rpto.tracing.interpolation import interpolate
 from sb3_rpto.tracing.starts import TRUST
 
 DECLARED = ["hinge.damping", "pole.mass"]

@@ -13,6 +13,7 @@ import pytest
 from simulated import compiled, problem, recorded
 from stable_baselines3.common.buffers import ReplayBuffer
 
+from sb3_rpto.algorithms.recorded import transitions
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.envs.corrected import apply_effects
@@ -95,10 +96,39 @@ def test_one_number_is_the_noise_of_all_and_what_no_observation_holds_has_none()
     np.testing.assert_allclose(np.append(noise.qpos[1:], noise.qvel), 0.02, rtol=0.03)
 
 
-@pytest.mark.parametrize("wrong", [-1e-3, 0.0, np.nan, [1e-3] * 4, "much"])
+def test_a_speed_that_noise_may_have_brought_below_its_bound_is_not_known() -> None:
+    env = gym.make(TASK)  # shows speeds up to 10
+    buffer = ReplayBuffer(40, env.observation_space, env.action_space)
+    rng = np.random.default_rng(0)
+    shown = np.tile([0.0, 0, 0, 1, 1, 0, 0, 0, 0], (41, 1))
+    shown[20:, 5] = 10 + 1e-2 * rng.standard_normal(21)
+    for row in range(40):
+        buffer.add(shown[[row]], shown[[row + 1]], np.zeros((1, 1), np.float32), np.zeros(1), np.zeros(1), [{}])
+    (episode,) = Measurements.from_replay(buffer, env, noise=NOISE).episodes
+    assert episode.usable[:20].all()
+    assert not episode.usable[20:].any()
+
+
+@pytest.mark.parametrize("wrong", [-1e-3, 0.0, np.nan, True, [1e-3] * 4, [[1.0], [1.0, 2.0]], "much"])
 def test_a_noise_that_is_none_is_refused(wrong: object) -> None:
-    with pytest.raises(ValueError, match=r"noise|could not convert"):
+    with pytest.raises(ValueError, match=r"the noise of the observations is .*; give a standard deviation above 0"):
         Measurements.from_replay(seen([], 4), gym.make(TASK), noise=wrong)  # type: ignore[arg-type]
+
+
+def test_a_noisy_sample_without_a_velocity_is_no_state() -> None:
+    env = gym.make("Pusher-v5")
+    buffer = ReplayBuffer(20, env.observation_space, env.action_space)
+    with pytest.raises(ValueError, match=r"Pusher-v5 do not hold the velocities of all joints \(2 of 11 are missing\)"):
+        Measurements.from_replay(buffer, env, noise=1e-3)
+
+
+def test_the_steps_behind_noisy_states_are_those_that_were_taken() -> None:
+    env, buffer = gym.make(TASK), seen([], 60)
+    data = Measurements.from_replay(buffer, env, noise=NOISE)
+    steps = transitions(data, env)
+    assert len(steps["actions"]) > 50  # but those that noise shows as over
+    off = np.abs(steps["actions"] - buffer.actions[:60, 0].T)
+    assert off.min(axis=1).max() < 1e-6
 
 
 def test_without_a_noise_nothing_changes() -> None:

@@ -10,7 +10,7 @@ from simulated import PENDULUM, compiled, recorded
 from sb3_rpto.effects import Simulation
 from sb3_rpto.effects.names import object_id
 from sb3_rpto.tracing import Measurements
-from sb3_rpto.tracing.identify import interpolate
+from sb3_rpto.tracing.interpolation import interpolate
 from sb3_rpto.tracing.windows import EXACT, cut, discretised, noise_levels
 
 SIGMA = np.array([1e-3])
