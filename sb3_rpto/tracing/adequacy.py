@@ -19,7 +19,7 @@ RESAMPLES = 400
 
 @dataclass(frozen=True)
 class Adequacy:
-    """Typical error of the windows over that of a true model with the estimated noise.
+    """Typical error of the windows over that of a true model with the noise of the data.
 
     :param ratio: of the medians
     :param low: 2.5 % quantile over resampled blocks, or of what noise alone does to so many windows if that is lower

@@ -93,7 +93,7 @@ class Report:
     :param adequacy_after: of the corrected model
     :param before: errors on test runs of the fitted declared model, by horizon
     :param after: of the corrected model
-    :param floor: of the corrected model on recordings of itself with the estimated noise; empty for exact data
+    :param floor: of the corrected model on recordings of itself with the noise of the data; empty for exact data
     :param force_before: force residual of the declared model on test runs, N·m or N, (nv,)
     :param force_after: of the corrected model, (nv,)
     :param learnable: share of what is left that a small regressor predicts, (nv,)
