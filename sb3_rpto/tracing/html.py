@@ -43,8 +43,8 @@ figcaption, .note { font-size: .9rem; color: #444; }
 
 METHOD = (
     "Runs were parted into train, select and test as wholes; the test runs were predicted once, at the end.",
-    "The declared parameters were fitted to short windows of the train runs, each simulated from its smoothed measured "
-    "start under the recorded commands, with a robust cost in units of the measurement noise.",
+    "The declared parameters were fitted to short windows of the train runs, each simulated from its measured start "
+    "under the recorded commands, with a robust cost in units of the measurement noise.",
     "R compares the error of select windows with what the noise alone would leave in them, their starts being fitted. "
     "Where R reaches one, the model is complete and nothing more was tried.",
     "Otherwise each candidate effect was screened: could these data show it, and does it look like another?",

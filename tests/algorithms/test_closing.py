@@ -487,7 +487,7 @@ def test_long_names_of_effects_are_logged(soon: None) -> None:
         ({"dynamics": "ensemble", "declared": ()}, "close_loop=True traces what a MuJoCo simulator lacks"),
         ({"close_loop": False, "declared": ()}, "nothing to fit"),
         ({"declared": ["pole.lenght"]}, "has no 'lenght'; did you mean 'length'"),
-        ({"dynamics_kwargs": {"observation_noise": 1e-3}, "close_loop": False}, "or pass close_loop=True"),
+        ({"dynamics_kwargs": {"observation_noise": 1e-3}, "close_loop": False}, "close_loop=True on a MuJoCo env"),
         ({"dynamics_kwargs": {"observation_noise": -1e-3}}, "standard deviation above 0"),
         ({"dynamics_kwargs": {"observation_noise": [1e-3] * 5}}, "each of the 9 observations"),
         ({"dynamics_kwargs": {"observation_noise": "much"}}, "'much'; give a standard deviation"),
