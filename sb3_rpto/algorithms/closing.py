@@ -34,7 +34,7 @@ MORE = 2
 #: Samples in a window: several steps show what acts late, and contacts do not amplify errors yet.
 WINDOW = 4
 #: What is missing grows with the square of the time, noise does not: where there is some, windows may have so many,
-#: as long as three of four episodes hold them.
+#: as long as three of four stretches of known states hold them.
 NOISY_WINDOW, SHORT_EPISODES = 6, 0.25
 #: So many transitions fill all windows of a trace: up to there more of noisy ones tell more.
 ENOUGH = 400
@@ -98,22 +98,32 @@ class LoopCloser:
             return False
         more = buffer.target_added >= MORE * self._traced_at
         blurred = dynamics.observation_noise is not None and self._traced_at < ENOUGH
-        if more and (blurred or self.found[-1]["verdict"] not in SETTLED):
+        if more and (blurred or not self.found or self.found[-1]["verdict"] not in SETTLED):
             return True
         return dynamics.error(model.transitions("target").take(slice(size - new, None))) > RISEN * self._error
 
     def close(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:
         """Trace on D_target, keep what lowers the error, log it, and renew D_source where another simulator made it.
 
-        The one-step error of noisy observations is mostly noise: where there is some, the report judges.
+        The one-step error of noisy observations is mostly noise: where there is some, the report judges. Transitions
+        that hold no window, or too few, are said to be such, and learning goes on.
         """
         assert model.env is not None
         data = model.transitions("target")
         noise, before = dynamics.observation_noise, dynamics.error(data)
         measured = Measurements.from_replay(model.replay_buffer, model.env, noise=noise)
         horizon = (window(measured) - 1) * float(single_env(model.env).unwrapped.dt)  # type: ignore[attr-defined]
-        report = self._trace(model, dynamics, measured, horizon)
         self._traced_at = model.replay_buffer.target_added
+        try:
+            report = self._trace(model, dynamics, measured, horizon)
+        except ValueError as error:  # of the data: what was passed was looked at before; a run must not end by it
+            self._error = before
+            warnings.warn(
+                f"{len(data)} target transitions were not traced: {error}; a trace is tried again when there are twice "
+                "as many",
+                stacklevel=2,
+            )
+            return
         added = self._take(model, dynamics, report, data, before if noise is None else math.inf)
         self._error = dynamics.error(data)
         _say(model, report, added, f"{len(data)} target transitions", before, self._error)
@@ -274,8 +284,12 @@ def _say(model: TransferAlgorithm, report: Report, added: list[str], data: str, 
 
 def window(measured: Measurements) -> int:
     """Number of samples in the windows of a trace of transitions."""
-    usual = int(np.quantile([len(episode) for episode in measured.episodes], SHORT_EPISODES))
-    return WINDOW if measured.exact else min(max(usual, WINDOW), NOISY_WINDOW)
+    if measured.exact:
+        return WINDOW
+    ends = [np.flatnonzero(~np.concatenate([[False], episode.usable, [False]])) for episode in measured.episodes]
+    stretches = np.concatenate([np.diff(end) - 1 for end in ends])  # of samples whose states are known
+    usual = int(np.quantile(stretches[stretches > 0], SHORT_EPISODES)) if stretches.any() else 0
+    return min(max(usual, WINDOW), NOISY_WINDOW)
 
 
 def deviation_of(traced: Traced) -> np.ndarray:

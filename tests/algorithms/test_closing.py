@@ -186,6 +186,30 @@ def test_phi_goes_on_being_fitted_where_what_was_traced_is_refused(soon: None, m
     assert not made.loop.keeps_phi
 
 
+def test_transitions_that_hold_no_window_end_no_run(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(closing, "WINDOW", 1_000)
+    made = model([])
+    with pytest.warns(UserWarning, match=r"80 target transitions were not traced: no episode holds.*twice as many"):
+        made.learn(90, source_timesteps=10)
+    assert made.num_timesteps == 90
+    assert made.loop is not None
+    assert not made.loop.reports
+    assert not made.loop.due(made, dynamics(made))
+    append(made, [], 210)
+    assert made.loop.due(made, dynamics(made))
+
+
+def test_windows_are_as_long_as_stretches_of_known_states() -> None:
+    def seen(*usable: list[int]) -> Measurements:
+        episodes = [SimpleNamespace(usable=np.array(flags, dtype=bool)) for flags in usable]
+        return SimpleNamespace(exact=False, episodes=episodes)  # type: ignore[return-value]
+
+    assert closing.window(seen([1] * 20)) == closing.NOISY_WINDOW
+    assert closing.window(seen([1] * 5, [1] * 5, [1] * 20)) == 5
+    assert closing.window(seen([1, 0, 1, 1, 0, 1, 0] + [1] * 9)) == closing.WINDOW
+    assert closing.window(seen([0] * 9)) == closing.WINDOW
+
+
 @pytest.mark.parametrize(("noise", "traced_at", "due"), [(1e-3, 200, True), (1e-3, 400, False), (None, 200, False)])
 def test_noisy_transitions_are_traced_once_more_when_they_fill_all_windows(
     noise: float | None, traced_at: int, due: bool
