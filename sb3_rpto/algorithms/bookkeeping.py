@@ -161,8 +161,7 @@ class TwoWorlds(PolicySnapshots):
         if self._judged_target or (self.loop is not None and not self.loop.found):
             return
         self._judged_target = True
-        noisy = self.loop is not None and self.loop.keeps_phi
-        found = doubts(self.dynamics, 0.0 if noisy else error)  # which is mostly noise there
+        found = doubts(self.dynamics, 0.0 if self._keeps_phi() else error)  # which is mostly noise there
         if found:
             warnings.warn(
                 f"after the fit {' and '.join(found)}: do the target's observations hold the model's joints in its "

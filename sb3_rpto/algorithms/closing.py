@@ -35,7 +35,7 @@ MORE = 2
 WINDOW = 4
 #: What is missing grows with the square of the time, noise does not: where there is some, windows may have so many,
 #: as long as three of four stretches of known states hold them.
-NOISY_WINDOW, SHORT_EPISODES = 6, 0.25
+NOISY_WINDOW, SHORT_STRETCHES = 6, 0.25
 #: So many transitions fill all windows of a trace: up to there more of noisy ones tell more.
 ENOUGH = 400
 #: What is found is kept when the one-step error falls below this share of the best without it.
@@ -111,10 +111,10 @@ class LoopCloser:
         assert model.env is not None
         data = model.transitions("target")
         noise, before = dynamics.observation_noise, dynamics.error(data)
-        measured = Measurements.from_replay(model.replay_buffer, model.env, noise=noise)
-        horizon = (window(measured) - 1) * float(single_env(model.env).unwrapped.dt)  # type: ignore[attr-defined]
         self._traced_at = model.replay_buffer.target_added
         try:
+            measured = Measurements.from_replay(model.replay_buffer, model.env, noise=noise)
+            horizon = (window(measured) - 1) * float(single_env(model.env).unwrapped.dt)  # type: ignore[attr-defined]
             report = self._trace(model, dynamics, measured, horizon)
         except ValueError as error:  # of the data: what was passed was looked at before; a run must not end by it
             self._error = before
@@ -288,7 +288,7 @@ def window(measured: Measurements) -> int:
         return WINDOW
     ends = [np.flatnonzero(~np.concatenate([[False], episode.usable, [False]])) for episode in measured.episodes]
     stretches = np.concatenate([np.diff(end) - 1 for end in ends])  # of samples whose states are known
-    usual = int(np.quantile(stretches[stretches > 0], SHORT_EPISODES)) if stretches.any() else 0
+    usual = int(np.quantile(stretches[stretches > 0], SHORT_STRETCHES)) if stretches.any() else 0
     return min(max(usual, WINDOW), NOISY_WINDOW)
 
 

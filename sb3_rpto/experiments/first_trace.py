@@ -57,6 +57,11 @@ class Job:
     noise: float = 0.0
     sensors: float = 0.0
 
+    @property
+    def planted(self) -> str:
+        """The study's shift that is in the target, gusts apart."""
+        return "declared" if self.shift == GUSTS else self.shift
+
 
 class Gusts(gym.Wrapper):
     """A force that changes with time alone, with a phase of its own in each episode."""
@@ -102,7 +107,7 @@ def first_transitions(job: Job, folder: Path) -> Measurements:
     """As many target transitions as a transfer takes before its first trace, by the source's stochastic policy."""
     agent, _ = source_agent(job.task, folder)
     settings: dict[str, Any] = {"buffer_size": FIRST, "learning_starts": 0, "gradient_steps": 0, "seed": job.seed}
-    target: gym.Env = make_target(job.task, "declared" if job.shift == GUSTS else job.shift, job.target)
+    target: gym.Env = make_target(job.task, job.planted, job.target)
     if job.shift == GUSTS:
         target = Gusts(target, job.seed)
     noise = sensor_noise(job.task, target, job.sensors) if job.sensors else None
@@ -148,7 +153,7 @@ def noisy_log(job: Job, folder: Path) -> Measurements:
 
 def judged(job: Job, report: Report) -> dict[str, Any]:
     """What a report says, beside what is true."""
-    effects = shifted(job.task, "declared" if job.shift == GUSTS else job.shift, job.target)
+    effects = shifted(job.task, job.planted, job.target)
     truth = {e.label: float(e.values[0]) for e in effects}
     there = {e.label for e in effects if not isinstance(e, Declared)}
     named = {traced.effect.label for traced in report.effects}

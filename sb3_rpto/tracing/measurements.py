@@ -48,7 +48,8 @@ class Measurements:
     :param exact: whether the samples come from a simulator: no measurement noise, exact velocities
     :param simulated: whether the model's own steps in time are to meet them, noise apart
     :param touching: whether contacts come and go in these measured data
-    :param noise: of positions and velocities, where it is known; None: it is estimated from the positions
+    :param noise: of positions and velocities, where it is known; None: it is estimated from the positions, and exact
+        samples have none
     """
 
     episodes: list[Episode]

@@ -67,6 +67,6 @@ def origin(
     continuous = error(data, sigma)
     if continuous < ENOUGH or error(replace(data, simulated=True), sigma) > CLEARLY * continuous:
         return "machine"
-    exact = replace(data, exact=True)
+    exact = replace(data, exact=True, noise=None)
     level = noise_levels(exact)
     return "exact" if np.all(sigma < NOISELESS * level) and error(exact, level) < ENOUGH else "simulated"

@@ -128,11 +128,13 @@ def prepare(
     if touching and horizon is None:
         message = f"{changes:.1f} a second come or go; windows of {length:.2g} s, as errors about a touch-down grow"
         findings.append(Finding("contacts", "fitted runs", message))
-    asked = not data.simulated  # what is known need not be found out
-    seems = origin(compiled, fitted, declared, sigma, length, threads, known) if asked else "machine"
-    if seems != "machine":
+    # What was told need not be found out.
+    seems = "told" if data.simulated else origin(compiled, fitted, declared, sigma, length, threads, known)
+    if seems in ("simulated", "exact"):
+        exact = seems == "exact"
         data, train, select, test, fitted = (
-            replace(d, simulated=True, exact=seems == "exact") for d in (data, train, select, test, fitted)
+            replace(d, simulated=True, exact=exact, noise=None if exact else d.noise)
+            for d in (data, train, select, test, fitted)
         )
         sigma = noise_levels(fitted)
         noise = "without noise" if data.exact else "with noise"
@@ -142,7 +144,7 @@ def prepare(
     train, select, test, fitted = (replace(d, touching=touching) for d in (train, select, test, fitted))
     nominal = discretised(compiled, fitted, fine=True)
     there = given(nominal, declared, known)
-    if seems == "machine" and not data.simulated:
+    if seems == "machine":
         findings += soft_friction(nominal)
     settings = {Declared(nominal, name, (-np.inf, np.inf)).number: name for name in data.columns.params}
     for one in there:

@@ -115,7 +115,7 @@ def start_state(
         if index + 1 < len(episode):
             after = episode.qvel[index + 1] - episode.qvel[index]
             qacc[dofs] = after / (episode.time[index + 1] - episode.time[index])
-        if data.noise is not None and not data.exact:
+        if data.noise is not None:
             if not data.simulated:
                 qvel -= half_step(model) * qacc
             spread[model.nv + dofs] = data.noise.qvel

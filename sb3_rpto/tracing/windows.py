@@ -93,7 +93,7 @@ def noise_levels(data: Measurements) -> np.ndarray:
     for i in range(len(data.columns.qpos)):
         if data.whole_states:
             spread = np.std(np.concatenate([e.qpos[:, i] for e in data.episodes]))
-            known = 0.0 if data.noise is None or data.exact else float(data.noise.qpos[i])
+            known = 0.0 if data.noise is None else float(data.noise.qpos[i])
             levels.append(max(known, EXACT * max(float(spread), 1e-3)))
             continue
         at = [_difference_noise(data.episodes, i, order) for order in range(3, 8)]
@@ -286,7 +286,7 @@ def _build(
         np.array([data.episodes[number].time[begin] for number, begin, _ in starts]),
         data.exact,
         data.touching,
-        data.noise is not None and not data.exact,
+        data.noise is not None,
     )
 
 
