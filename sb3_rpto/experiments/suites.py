@@ -215,11 +215,12 @@ def _many_updates(ensemble: float, alone: float) -> tuple[Variant, ...]:
     )
 
 
-RESIDUAL = Variant("rpto-residual", "rpto", {"dynamics": "residual", "declared": list(LENGTHS)}, 5, 400)
+RESIDUAL = {"dynamics": "residual", "declared": list(LENGTHS)}
+RESIDUALS = (Variant("rpto-residual", "rpto", RESIDUAL, 5, 400), Variant("rto-residual", "rto", RESIDUAL, 5, 200))
 FURTHER = Suite(
     "further",
     "what quick leaves out: 20 updates a target step, with the learned model and without; the residual model",
-    _small_places(_many_updates(200, 80), (*_many_updates(250, 200), RESIDUAL)),
+    _small_places(_many_updates(200, 80), (*_many_updates(250, 200), *RESIDUALS)),
 )
 
 _TINY = {"policy_kwargs": {"net_arch": [16]}, "learning_starts": 50}

@@ -257,6 +257,11 @@ def _data(report: Report) -> str:
     levels = [
         [name, wording.number(value, 3), wording.position_unit(model, name)] for name, value in report.noise.items()
     ]
+    if data.noise is not None:
+        levels += [
+            [f"{name}, velocity", wording.number(value, 3), f"{wording.dof_unit(model, dof)}/s"]
+            for dof, (name, value) in enumerate(zip(data.columns.qvel, data.noise.qvel))
+        ]
     lines.append(_table(["column", "noise, standard deviation", "unit"], levels, numbers=(1,)))
     if data.exact:
         lines.append(_note("The samples come from a simulator: the noise is a token, small share of the motion."))

@@ -64,7 +64,10 @@ def dof_name(model: mujoco.MjModel, dof: int) -> str:
 
 def dof_unit(model: mujoco.MjModel, dof: int) -> str:
     """rad or m."""
-    return "m" if model.jnt_type[model.dof_jntid[dof]] == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+    joint = model.dof_jntid[dof]
+    slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+    travels = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE and dof - model.jnt_dofadr[joint] < 3
+    return "m" if slides or travels else "rad"
 
 
 def force_unit(model: mujoco.MjModel, dof: int) -> str:

@@ -13,6 +13,7 @@ import pytest
 from sb3_rpto.effects.effect import LIBRARY
 from sb3_rpto.tracing import Finding, Report, causes, figures, wording
 from sb3_rpto.tracing.html import render
+from sb3_rpto.tracing.measurements import Noise
 from sb3_rpto.tracing.report import Candidate
 
 
@@ -53,6 +54,15 @@ class Reader(HTMLParser):
             self.words.append(data)
         if "td" in self.open:
             self.cells[-1] += data
+
+
+def test_known_noise_is_listed_of_velocities_too(report: Report) -> None:
+    joints = report.data.columns.qvel
+    assert f"{joints[0]}, velocity" not in Reader(render(report)).cells
+    noise = Noise(np.full(len(report.data.columns.qpos), 0.001), np.linspace(0.0125, 0.0225, len(joints)))
+    cells = Reader(render(replace(report, data=replace(report.data, noise=noise)))).cells
+    at = cells.index(f"{joints[0]}, velocity")
+    assert cells[at + 1 : at + 3] == ["0.0125", "rad/s"]
 
 
 def test_page_is_whole_and_needs_nothing_else(page: str) -> None:
