@@ -25,7 +25,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from tqdm import tqdm
 
 from sb3_rpto import RPTO
-from sb3_rpto.algorithms.rehearsals import Rehearsals
+from sb3_rpto.algorithms.closing import LoopCloser
 from sb3_rpto.experiments.closed_loop import TASKS, make_source, make_target, source_agent
 from sb3_rpto.experiments.run import EVALUATION_SEED
 
@@ -40,8 +40,8 @@ def run(job: tuple[bool, int]) -> list[dict[str, Any]]:
     th.set_num_threads(1)
     agent, _ = source_agent(TASK, RUNS)
     target = make_vec_env(partial(make_target, TASK, SHIFT, 0), n_envs=20)
-    due = nullcontext() if rehearsed else mock.patch.object(Rehearsals, "due", return_value=False)
-    with due:
+    judged = nullcontext() if rehearsed else mock.patch.object(LoopCloser, "may_judge", return_value=False)
+    with judged:
         model = RPTO.from_source(
             *(agent, make_source(TASK), make_target(TASK, SHIFT, 0)),
             dynamics="physical",

@@ -152,9 +152,6 @@ class TwoWorlds(PolicySnapshots):
         if self.dynamics_config is not None and is_mujoco(self.dynamics_config):
             check_machine(source, target)
 
-    def _keeps_phi(self) -> bool:
-        return self.loop is not None and self.loop.keeps_phi
-
     def _doubt_the_target(self, error: float) -> None:
         """Warn, after the first fit (with the loop closed: after the first trace), where the simulator does not fit."""
         assert self.dynamics is not None

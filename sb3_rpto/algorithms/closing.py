@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms import warm
-from sb3_rpto.algorithms.rehearsals import Rehearsals
+from sb3_rpto.algorithms.rehearsals import LEARNER, Rehearsals
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
@@ -23,7 +23,7 @@ from sb3_rpto.tracing.report import Traced
 from sb3_rpto.tracing.trace import SETTLED
 
 if TYPE_CHECKING:
-    from sb3_rpto.algorithms.transfer import TransferAlgorithm
+    from sb3_rpto.algorithms.looping import Looping
 
 #: Target transitions before the first trace, and new ones before another.
 FIRST, AGAIN = 200, 200
@@ -85,7 +85,7 @@ class LoopCloser:
         self._traced_at, self._error, self.rehearsals = None, math.inf, Rehearsals()
         self.accounts = self.keeps_phi = False
 
-    def due(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
+    def due(self, model: Looping, dynamics: PhysicalDynamics) -> bool:
         """Whether enough was seen for a first trace, for a better one than the last, or is no longer predicted."""
         buffer = model.replay_buffer
         size, capacity = buffer.target.size(), buffer.target.buffer_size
@@ -102,7 +102,7 @@ class LoopCloser:
             return True
         return dynamics.error(model.transitions("target").take(slice(size - new, None))) > RISEN * self._error
 
-    def close(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:
+    def close(self, model: Looping, dynamics: PhysicalDynamics) -> None:
         """Trace on D_target, keep what lowers the error, log it, and renew D_source where another simulator made it.
 
         The one-step error of noisy observations is mostly noise: where there is some, the report judges. Transitions
@@ -130,7 +130,7 @@ class LoopCloser:
         self.stale = bool(added) or outdated(model, dynamics)
         self.renew(model)
 
-    def close_on_log(self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements) -> None:
+    def close_on_log(self, model: Looping, dynamics: PhysicalDynamics, measured: Measurements) -> None:
         """Trace on a robot's log itself, by multiple shooting: one-step errors of noisy samples tell next to nothing.
 
         phi takes all that is found, as long as the simulator with it is stable, and where the verdict is
@@ -145,12 +145,25 @@ class LoopCloser:
         self.stale = model.replay_buffer.source.size() > 0 or not model._warm
         _say(model, report, added, f"{len(measured.episodes)} recorded episodes", before, dynamics.error(data))
 
-    def renew(self, model: TransferAlgorithm) -> None:
+    def begin(self, model: Looping) -> None:
+        """Before the rounds of ``learn()``: what the last one left undone."""
+        self.renew(model)
+        if model._offline:
+            self.rehearsals.take_up_learner(model)
+
+    def finish(self, model: Looping) -> None:
+        """After the rounds: where the target is a log the last policy is yet to be judged."""
+        if model._offline and self.may_judge(model):
+            self.rehearse(model)
+            self.rehearsals.leave_best(model)
+
+    def renew(self, model: Looping) -> None:
         """Drop what is :attr:`stale`, if anything is, and learn anew; a budget of source steps learns by itself.
 
         Where that is interrupted it is done when the run goes on.
         """
         if self.stale:
+            model.snapshots.pop(LEARNER, None)  # of the simulator that is dropped
             renew_source(model)
             if not model._offline:
                 learn_in_source(model, lambda: self.rehearse(model))
@@ -158,25 +171,38 @@ class LoopCloser:
                     self.rehearsals.go_back(model)
             self.stale = False
 
-    def may_judge(self, model: TransferAlgorithm) -> bool:
+    def may_judge(self, model: Looping) -> bool:
         """Whether rehearsals say anything: the policy learns, and the simulator accounts for the target."""
         return model.updates_policy and self.accounts
 
-    def rehearse(self, model: TransferAlgorithm) -> None:
+    def rehearse(self, model: Looping) -> None:
         """Let the policy play in the simulator, where that may judge it."""
         if self.may_judge(model):
             assert isinstance(model.dynamics, PhysicalDynamics)  # what was traced
             self.rehearsals.rehearse(model, model.dynamics)
 
-    def watch(self, model: TransferAlgorithm) -> None:
-        """Where much was learned since the last rehearsal, rehearse, and go back to the best policy if it got worse."""
-        if self.may_judge(model) and self.rehearsals.due(model):
+    def watch(self, model: Looping) -> None:
+        """Where enough is owed or was learned: learn what target steps pay for, rehearse, and let the best policy act.
+
+        With a log for a target the policy acts in the simulator alone, and goes on unless it clearly got worse.
+        """
+        judges = self.may_judge(model)
+        if judges and not self.rehearsals.due(model):
+            return
+        if model._owed:
+            self.rehearsals.take_up_learner(model)
+        for _ in range(model._owed):
+            learn_for_a_step(model)
+        model._owed = 0
+        if judges:
             self.rehearse(model)
-            if self.rehearsals.clearly_worse():
+            if not model._offline:
+                self.rehearsals.leave_best(model)
+            elif self.rehearsals.clearly_worse():
                 self.rehearsals.go_back(model)
 
     def _trace(
-        self, model: TransferAlgorithm, dynamics: PhysicalDynamics, measured: Measurements, horizon: float | None
+        self, model: Looping, dynamics: PhysicalDynamics, measured: Measurements, horizon: float | None
     ) -> Report:
         assert model.env is not None
         report = trace(
@@ -196,7 +222,7 @@ class LoopCloser:
 
     def _take(
         self,
-        model: TransferAlgorithm,
+        model: Looping,
         dynamics: PhysicalDynamics,
         report: Report,
         data: Transitions,
@@ -237,7 +263,7 @@ class LoopCloser:
         return new
 
 
-def trace_log(model: TransferAlgorithm) -> None:
+def trace_log(model: Looping) -> None:
     """Once, before anything is learned: phi from a trace of the robot's log, where one was given.
 
     :raises ValueError: it is to be traced and is not there
@@ -258,7 +284,7 @@ def trace_log(model: TransferAlgorithm) -> None:
         loop.close_on_log(model, dynamics, model.measured)
 
 
-def _say(model: TransferAlgorithm, report: Report, added: list[str], data: str, before: float, after: float) -> None:
+def _say(model: Looping, report: Report, added: list[str], data: str, before: float, after: float) -> None:
     """Log what a trace found, and what it did to the one-step error."""
     logger = model.logger
     logger.record("gap/residual_before", before)
@@ -330,19 +356,30 @@ def _from_resets(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
     return observations, np.array(actions)
 
 
-def outdated(model: TransferAlgorithm, dynamics: PhysicalDynamics) -> bool:
+def outdated(model: Looping, dynamics: PhysicalDynamics) -> bool:
     """Whether D_source holds what another simulator than the present one produced."""
     return dynamics.error(model.transitions("source").take(slice(OLDEST))) > OTHER
 
 
-def renew_source(model: TransferAlgorithm) -> None:
+def renew_source(model: Looping) -> None:
     """Drop what another simulator produced, and take the first :data:`FILL` steps in the present one."""
     assert model._source_world is not None
     model.replay_buffer.source.reset()
     model.source_timesteps += model._source_world.interact(model, FILL)
 
 
-def learn_in_source(model: TransferAlgorithm, rehearse: Callable[[], None]) -> None:
+def learn_for_a_step(model: Looping) -> int:
+    """Steps 3, 5 and 6 of a round with one target step, but for the fit; the number of source steps."""
+    assert model._source_world is not None
+    if model.use_sde:
+        model.actor.reset_noise()
+    taken = model._source_world.interact(model, int(model.source_steps))
+    model.source_timesteps += taken
+    model.train(model.updates_per_step, model.batch_size)
+    return taken
+
+
+def learn_in_source(model: Looping, rehearse: Callable[[], None]) -> None:
     """Learn in the present simulator by rounds while its episodes earn more; the target waits meanwhile.
 
     :param rehearse: called before the first round and after each
@@ -350,18 +387,12 @@ def learn_in_source(model: TransferAlgorithm, rehearse: Callable[[], None]) -> N
     rehearse()
     source = model._source_world
     assert isinstance(source, EpisodeSource)
-    updates_per_step = max(model.gradient_steps, 1) / int(model.source_steps)
     best, idle, steps = -math.inf, 0, 0
     while steps < FRESH and idle < PATIENCE:
         source.returns.clear()
         end = min(steps + ROUND, FRESH)
         while steps < end:
-            if model.use_sde:
-                model.actor.reset_noise()
-            taken = source.interact(model, int(model.source_steps))
-            model.source_timesteps += taken
-            model.train(round(taken * updates_per_step), model.batch_size)
-            steps += taken
+            steps += learn_for_a_step(model)
         # Where no episode ended there is nothing to judge by, and learning goes on.
         earned = float(np.mean(source.returns)) if source.returns else math.inf
         if model.verbose:

@@ -12,12 +12,14 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.envs.stance import StandingEnv
 
 if TYPE_CHECKING:
-    from sb3_rpto.algorithms.transfer import TransferAlgorithm
+    from sb3_rpto.algorithms.looping import Looping
 
 #: Episodes of a rehearsal, always from the same starts, and their most steps where the task has no end.
 EPISODES, LONGEST, SEED = 25, 1_000, 30_000
 #: Updates of the policy between two rehearsals.
-EVERY = 4_000
+EVERY = 2_000
+#: Name of the snapshot that goes on learning, while a better policy acts.
+LEARNER = "learner"
 #: A policy that earns less than the best by more than this share, and by more than the standard error of what the best
 #: earned, is given up for it: an early fall in one of all episodes is enough.
 LOST = 0.03
@@ -42,11 +44,11 @@ class Rehearsals:
         self._names: list[str] = []
         self._at_update = -np.inf  # the first one as soon as the simulator accounts for the target
 
-    def due(self, model: TransferAlgorithm) -> bool:
-        """Whether the policy has learned enough since the last one."""
-        return model._n_updates - self._at_update >= EVERY
+    def due(self, model: Looping) -> bool:
+        """Whether the policy has learned enough since the last one, or will with what is owed."""
+        return model._n_updates + model._owed * model.updates_per_step - self._at_update >= EVERY
 
-    def rehearse(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:
+    def rehearse(self, model: Looping, dynamics: PhysicalDynamics) -> None:
         """Play, and keep the policy if it is the best so far."""
         self._at_update = model._n_updates
         if self._has_moved(dynamics):
@@ -62,7 +64,7 @@ class Rehearsals:
         """Whether the last policy earned much less than the best one, and more so than episodes differ."""
         return self.last < self.best - LOST * abs(self.best) - self._error
 
-    def go_back(self, model: TransferAlgorithm) -> None:
+    def go_back(self, model: Looping) -> None:
         """Take up the best policy again, unless the last one is."""
         if self.last < self.best:
             model.rollback("simulator")
@@ -70,7 +72,22 @@ class Rehearsals:
                 print(f"back to a policy that earns {self.best:.5g} in the simulator; the last one: {self.last:.5g}")
             self.last = self.best
 
-    def _rehearse_best(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> None:
+    def leave_best(self, model: Looping) -> None:
+        """Let the best policy act; the last one is kept to go on learning, unless it clearly got worse."""
+        if self.last < self.best:
+            if not self.clearly_worse():
+                model.take_snapshot(LEARNER)
+            learner = model.snapshots.get(LEARNER)
+            self.go_back(model)
+            if learner is not None:
+                model.snapshots[LEARNER] = learner
+
+    def take_up_learner(self, model: Looping) -> None:
+        """Go on with the policy that learns, where another one acts."""
+        if LEARNER in model.snapshots:
+            model.rollback(LEARNER)
+
+    def _rehearse_best(self, model: Looping, dynamics: PhysicalDynamics) -> None:
         """The best policy so far, in the simulator as it is now; in the beginning, the one from the source."""
         model.snapshots.setdefault("simulator", model.snapshots["source"])
         model.take_snapshot("present")
@@ -90,7 +107,7 @@ class Rehearsals:
             return True
         return bool((np.abs(dynamics.values - self._phi) > MOVED * dynamics.scale).any())
 
-    def _play(self, model: TransferAlgorithm, dynamics: PhysicalDynamics) -> np.ndarray:
+    def _play(self, model: Looping, dynamics: PhysicalDynamics) -> np.ndarray:
         """Returns of the deterministic policy in copies of the simulator, an episode each; its steps are counted."""
         assert model.env is not None
         copies = [StandingEnv(copied(model.env), dynamics.effects()) for _ in range(EPISODES)]

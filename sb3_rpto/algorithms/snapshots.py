@@ -12,7 +12,8 @@ from sb3_rpto.algorithms.update import RelativeUpdate
 class PolicySnapshots(RelativeUpdate):
     """Keeps the policy that came from the source and the best one seen in the target."""
 
-    #: by name: "source" (as it came), "best" (highest return in the target), "simulator" (in the fitted simulator)
+    #: by name: "source" (as it came), "best" (highest return in the target), "simulator" (in the fitted simulator),
+    #: "learner" (goes on learning while that one acts)
     snapshots: dict[str, dict[str, Any]]
     best_mean_reward: float
     #: what ``best_mean_reward`` is: the mean of recent training episodes, or an evaluation (``callbacks.KeepBest``)
@@ -35,6 +36,7 @@ class PolicySnapshots(RelativeUpdate):
         self.best_mean_reward = -np.inf
         self.snapshots.pop("best", None)
         self.snapshots.pop("simulator", None)
+        self.snapshots.pop("learner", None)
 
     def rollback(self, to: str = "best") -> None:
         """Go back to a policy that was kept.
@@ -46,6 +48,7 @@ class PolicySnapshots(RelativeUpdate):
         if to not in self.snapshots:
             raise ValueError(f"no policy {to!r} to roll back to; there is {sorted(self.snapshots) or 'none yet'}")
         snapshot = self.snapshots[to]
+        self.snapshots.pop("learner", None)  # what goes on learning is this one
         self.policy.load_state_dict(snapshot["policy"])
         if self.log_ent_coef is not None:
             self.log_ent_coef.data.fill_(float(np.log(snapshot["temperature"])))

@@ -19,8 +19,8 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_rpto.algorithms import arguments, checkpoint, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
-from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.algorithms.closing import LoopCloser, trace_log
+from sb3_rpto.algorithms.looping import Looping
 from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_world
 from sb3_rpto.algorithms.worlds import check_environment, check_spaces, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
@@ -35,14 +35,14 @@ from sb3_rpto.tracing import Measurements
 Self = TypeVar("Self", bound="TransferAlgorithm")
 
 
-class TransferAlgorithm(Resumable):
+class TransferAlgorithm(Looping):
     """Base of :class:`RPO`, :class:`RTO` and :class:`RPTO`; use one of those.
 
     Here are the constructor and the loop of Algorithm 1 with steps 3 and 4. What it stands on, from SAC up: the updates
     of steps 5 and 6 (:class:`~sb3_rpto.algorithms.update.RelativeUpdate`), policies to go back to
     (:class:`~sb3_rpto.algorithms.snapshots.PolicySnapshots`), the two environments and SB3's accounts of them
-    (:class:`~sb3_rpto.algorithms.bookkeeping.TwoWorlds`), and files
-    (:class:`~sb3_rpto.algorithms.checkpoint.Resumable`).
+    (:class:`~sb3_rpto.algorithms.bookkeeping.TwoWorlds`), files (:class:`~sb3_rpto.algorithms.checkpoint.Resumable`),
+    and the closed loop's part (:class:`~sb3_rpto.algorithms.looping.Looping`).
 
     The arguments up to ``device`` are SAC's, with SAC's defaults, except that ``gradient_steps`` counts updates per
     TARGET step and ``learning_starts`` applies to the source alone (no random action is ever taken in the target).
@@ -345,7 +345,7 @@ class TransferAlgorithm(Resumable):
         self.begin_in_source(source_timesteps, progress_bar)
         checkpoint.resume(self)
         if self.loop is not None:
-            self.loop.renew(self)
+            self.loop.begin(self)
         self._watch_for_null_shift()
         self._callback = callback
         callback.on_training_start(locals(), globals())
@@ -357,6 +357,8 @@ class TransferAlgorithm(Resumable):
             if not self.interact_with_target(callback, log_interval):  # step 4
                 break
             self._end_round()
+        if self.loop is not None:
+            self.loop.finish(self)
         callback.on_training_end()
         self._callback = None
         return self
@@ -389,6 +391,8 @@ class TransferAlgorithm(Resumable):
 
     def interact_with_source(self) -> None:
         """Step 3: act in the source P_phi, ``source_steps`` times for each target step, and fill D_source."""
+        if self.learns_at_fits():
+            return
         if self.use_sde:
             self.actor.reset_noise()
         assert self._source_world is not None  # learn() has made it
@@ -426,16 +430,6 @@ class TransferAlgorithm(Resumable):
             self.store_step(callback.locals)  # SB3 drops the step after which a callback stops
         self._collected = rollout.episode_timesteps
         return rollout.continue_training
-
-    def _close_the_loop(self) -> None:
-        if self.loop is not None and self.close_loop is not False:
-            assert isinstance(self.dynamics, PhysicalDynamics)  # checked by the constructor
-            if self.loop.due(self, self.dynamics):
-                self.loop.close(self, self.dynamics)
-
-    def _rehearse(self) -> None:
-        if self.loop is not None:
-            self.loop.watch(self)
 
     def dump_logs(self) -> None:
         """SB3's log plus what the source spent and earned."""

@@ -64,10 +64,14 @@ class RelativeUpdate(SAC):
     #: those are measurements, and phi comes from a trace of them instead of from fits to transitions
     _traces_log: bool
 
+    @property
+    def updates_per_step(self) -> int:
+        """Updates of critic and actor for a target step."""
+        return self.gradient_steps if self.gradient_steps >= 0 else 1  # SB3: negative means one a step
+
     def update(self) -> None:
-        """Steps 5 and 6: ``gradient_steps`` updates of critic and actor for each new target step, then the dynamics."""
-        updates = self.gradient_steps if self.gradient_steps >= 0 else 1  # SB3: negative means one a step
-        self.train(self._collected * updates, self.batch_size)
+        """Steps 5 and 6: updates of critic and actor for each new target step, then the dynamics."""
+        self.train(self._collected * self.updates_per_step, self.batch_size)
         self.fit_dynamics()
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:

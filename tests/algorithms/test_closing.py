@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPTO
@@ -577,7 +578,7 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
         use_sde=True,
         actor=SimpleNamespace(reset_noise=lambda: noises.append(None)),
         _source_world=Scripted(earns),
-        gradient_steps=30,
+        updates_per_step=30,
         source_steps=20,
         batch_size=32,
         source_timesteps=5,
@@ -622,9 +623,9 @@ def spoil(made: RPTO) -> None:
             parameter += 0.1
 
 
-@pytest.mark.parametrize(("earned", "kept"), [(96.0, False), (98.0, True), (120.0, True)])
-def test_a_policy_that_clearly_got_worse_is_given_up(
-    earned: float, kept: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("earned", [96.0, 98.0, 120.0])
+def test_the_best_policy_acts_and_one_that_did_not_clearly_get_worse_goes_on_learning(
+    earned: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = forgetful()
     scripted(made, monkeypatch, 50.0, 100.0, earned)
@@ -634,9 +635,70 @@ def test_a_policy_that_clearly_got_worse_is_given_up(
     spoil(made)
     changed = weights(made)
     made.loop.watch(made)
-    np.testing.assert_array_equal(weights(made), changed if kept else best)
+    np.testing.assert_array_equal(weights(made), changed if earned > 100 else best)
+    assert ("learner" in made.snapshots) == (earned == 98.0)
     made.rollback("simulator")
     np.testing.assert_array_equal(weights(made), changed if earned > 100 else best)
+    assert "learner" not in made.snapshots  # what a user goes back to goes on learning
+
+
+@pytest.mark.parametrize(("earned", "goes_on"), [(96.0, "best"), (98.0, "learner")])
+def test_what_is_owed_is_learned_by_the_policy_that_goes_on_learning(
+    earned: float, goes_on: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = forgetful()
+    scripted(made, monkeypatch, 50.0, 100.0, earned, 99.0)
+    assert made.loop is not None
+    made.loop.watch(made)
+    wanted = {"best": weights(made)}
+    spoil(made)
+    wanted["learner"] = weights(made)
+    made.loop.watch(made)
+    begun: list[np.ndarray] = []
+    monkeypatch.setattr(made, "train", lambda *_: begun.append(weights(made)))
+    made._owed = 3
+    made.loop.watch(made)
+    np.testing.assert_array_equal(begun, [wanted[goes_on]] * 3)
+    np.testing.assert_array_equal(weights(made), wanted["best"])
+    assert made._owed == 0
+
+
+def test_between_fits_the_policy_stays_as_the_simulator_judged_it(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_rpto.algorithms.rehearsals.EVERY", 40)
+    made = forgetful()
+    assert made.loop is not None
+    monkeypatch.setattr(made.loop, "due", lambda *_: False)
+    monkeypatch.setattr(made.loop.rehearsals, "_play", lambda *_: np.full(25, 1.0))
+    updates, source, acts, at = made._n_updates, made.source_timesteps, weights(made), made.num_timesteps
+
+    class Watch(BaseCallback):
+        def _on_step(self) -> bool:
+            seen.append((made.num_timesteps - at, made._n_updates - updates, bool((weights(made) == acts).all())))
+            return True
+
+    seen: list[tuple[int, int, bool]] = []
+    made._since_fit = 0
+    made.learn(50, callback=Watch(), reset_num_timesteps=False)
+    assert [(done, same) for _, done, same in seen] == [(0, True)] * 40 + [(40, False)] * 10
+    assert made.source_timesteps - source == 4 * 40  # rehearsals are scripted
+    assert made._owed == 10
+
+
+def test_after_a_log_the_best_policy_is_left_and_the_last_one_goes_on_learning(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
+    made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)
+    assert made.loop is not None
+    scripted(made, monkeypatch, 99.0, 99.0)
+    monkeypatch.setattr(made.loop.rehearsals, "due", lambda _: False)
+    made.loop.rehearsals.best = 100.0
+    best = weights(made)
+    made.take_snapshot("simulator")
+    spoil(made)
+    last = weights(made)
+    made.loop.finish(made)
+    np.testing.assert_array_equal(weights(made), best)
+    made.loop.begin(made)
+    np.testing.assert_array_equal(weights(made), last)
 
 
 def test_the_first_policy_to_be_beaten_is_that_of_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -671,8 +733,10 @@ def test_a_loss_within_what_episodes_differ_by_is_none(monkeypatch: pytest.Monke
     spoil(made)
     changed = weights(made)
     made.loop.watch(made)
+    made.loop.rehearsals.take_up_learner(made)
     np.testing.assert_array_equal(weights(made), changed)
     made.loop.watch(made)
+    assert "learner" not in made.snapshots
     assert not np.array_equal(weights(made), changed)
 
 

@@ -1,0 +1,50 @@
+"""The closed loop's part in Algorithm 1: traces after fits, and a policy that the simulator judges before it acts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sb3_rpto.algorithms.checkpoint import Resumable
+from sb3_rpto.dynamics.physical import PhysicalDynamics
+from sb3_rpto.tracing import Measurements
+
+
+class Looping(Resumable):
+    """Calls :class:`~sb3_rpto.algorithms.closing.LoopCloser`, where there is one, when it is its turn.
+
+    From the moment on at which the simulator accounts for the target, target steps teach the policy nothing that the
+    simulator does not. Then steps 3, 5 and 6 of the rounds between two fits are done together at the second of them,
+    the simulator judges what came of it, and only the best policy so far acts in the target.
+    """
+
+    #: what to look for, as the user asked
+    close_loop: bool | Sequence[str]
+    #: the robot's log, where one was given
+    measured: Measurements | None
+    #: target steps for which the policy has not learned yet
+    _owed: int = 0
+
+    def learns_at_fits(self) -> bool:
+        """Whether steps 3 and 5 wait for the next fit."""
+        return self.loop is not None and not self._offline and self.loop.may_judge(self)
+
+    def update(self) -> None:
+        """Steps 5 and 6, or the latter's fit alone where the policy learns at fits."""
+        if self.learns_at_fits():
+            self._owed += self._collected
+            self.fit_dynamics()
+        else:
+            super().update()
+
+    def _keeps_phi(self) -> bool:
+        return self.loop is not None and self.loop.keeps_phi
+
+    def _close_the_loop(self) -> None:
+        if self.loop is not None and self.close_loop is not False:
+            assert isinstance(self.dynamics, PhysicalDynamics)  # checked by the constructor
+            if self.loop.due(self, self.dynamics):
+                self.loop.close(self, self.dynamics)
+
+    def _rehearse(self) -> None:
+        if self.loop is not None:
+            self.loop.watch(self)
