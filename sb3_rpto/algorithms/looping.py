@@ -36,6 +36,9 @@ class Looping(Resumable):
         else:
             super().update()
 
+    def _worlds_are_alike(self) -> bool:
+        return self.loop is not None and self.loop.accounts
+
     def _keeps_phi(self) -> bool:
         return self.loop is not None and self.loop.keeps_phi
 

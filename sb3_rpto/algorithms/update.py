@@ -178,6 +178,10 @@ class RelativeUpdate(SAC):
     def _adopt_target_rules(self) -> None:
         """From the first fit on the model is one of the target: let what is known of the task be the target's."""
 
+    def _worlds_are_alike(self) -> bool:
+        """Whether P_phi is known to account for the target, so that its many states stand for the target's few."""
+        return False
+
     def _keeps_phi(self) -> bool:
         """Whether phi is known better than fits to transitions could tell."""
         return False
@@ -195,13 +199,14 @@ class RelativeUpdate(SAC):
         """For each of ``count`` updates a batch for the critic, mostly of D_source, and one for the actor.
 
         The actor sees four batches of D_target, then one of D_source; D_source alone as long as D_target could not
-        fill a batch; a policy that does not learn sees the critic's. All are gathered at once.
+        fill a batch, and where both worlds are known to be alike; a policy that does not learn sees the critic's. All
+        are gathered at once.
         """
         for_critic = self.critic_batches(count, batch_size)
         if self._pretraining or not self.updates_policy:
             yield from ((batch, batch) for batch in for_critic)
             return
-        scarce = self.replay_buffer.target.size() < batch_size
+        scarce = self.replay_buffer.target.size() < batch_size or self._worlds_are_alike()
         turns = [(self._actor_updates + i) % ALTERNATION == ALTERNATION - 1 for i in range(count)]
         from_source = [turn or scarce for turn in turns]
         for_actor = {

@@ -684,6 +684,16 @@ def test_between_fits_the_policy_stays_as_the_simulator_judged_it(soon: None, mo
     assert made._owed == 10
 
 
+@pytest.mark.parametrize("accounts", [True, False])
+def test_the_actor_sees_the_simulators_states_alone_where_it_accounts_for_the_target(accounts: bool) -> None:
+    made = forgetful()
+    assert made.loop is not None
+    made.loop.accounts = accounts
+    made.replay_buffer.source.rewards[:], made.replay_buffer.target.rewards[:] = -1, 1
+    worlds = {float(actor.rewards.mean()) for _, actor in made.sample_batches(10, 16)}
+    assert worlds == ({-1.0} if accounts else {-1.0, 1.0})
+
+
 def test_after_a_log_the_best_policy_is_left_and_the_last_one_goes_on_learning(monkeypatch: pytest.MonkeyPatch) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)
