@@ -96,6 +96,8 @@ class TwoWorlds(PolicySnapshots):
     _has_target_rules: bool
     #: traces what the simulator lacks, where that was asked for
     loop: LoopCloser | None
+    #: target steps for which the policy has not learned yet: a closed loop may put that off until a fit
+    _owed: int = 0
     #: whether the simulator was judged after its first fit to this target
     _judged_target: bool = False
     #: the run's callbacks while it lasts: they know the step that SB3 has taken and not yet stored
@@ -127,6 +129,7 @@ class TwoWorlds(PolicySnapshots):
             for earned in (self.ep_info_buffer, self.ep_success_buffer):
                 if earned is not None:
                     earned.clear()
+            self._owed = 0
             if self.loop is not None:
                 self.loop.forget_target()
             if self.replay_buffer.target.size() > 0:
@@ -138,6 +141,8 @@ class TwoWorlds(PolicySnapshots):
                 self.replay_buffer.target.reset()
             if self._resume_state is not None:  # where that target stood, and a step of it that is not stored
                 self._resume_state |= {"target": None, "last_obs": None, "unstored_step": None}
+        if self._offline and self.loop is not None:
+            self.loop.accounts = False  # of a log; the target itself has yet to show that it does
         self._bind_rules(venv, of_target=True)
         self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
         self._offline = self._traces_log = False

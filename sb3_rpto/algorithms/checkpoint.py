@@ -60,7 +60,8 @@ class Resumable(TwoWorlds):
         if self.target_env is not None:  # a callback may save in the middle of a rollout
             self.target_spent = dict(find_ledger(self.target_env).spent)
         loaded = self._resume_state  # a loaded model that has not learned since stands where it was saved first
-        self._resume_state = {**loaded, "warm": self._warm} if loaded else capture(self)
+        learner = self.snapshots.get("learner")
+        self._resume_state = {**loaded, "warm": self._warm, "learner": learner} if loaded else capture(self)
         config, self.dynamics_config = self.dynamics_config, _picklable(self.dynamics_config)
         try:
             write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
@@ -114,6 +115,8 @@ class Resumable(TwoWorlds):
             saved_by = "RPO" if model.dynamics is None else "RTO or RPTO"
             raise ValueError(f"{path} was saved by {saved_by}, {cls.__name__} cannot continue it; load it there")
         model._warm = model._resume_state["warm"]
+        if model._resume_state.get("learner") is not None:  # set_parameters() has dropped it
+            model.snapshots["learner"] = model._resume_state["learner"]
         if model.env is not None:
             model._bind_rules(model.env, of_target=False)
         if target_env is not None:
@@ -123,6 +126,7 @@ class Resumable(TwoWorlds):
     def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto") -> None:
         """As in SB3; a model that was given parameters counts as warm-started and is not trained in the source."""
         super().set_parameters(load_path_or_dict, exact_match, device)
+        self.snapshots.pop("learner", None)  # what goes on learning is this one
         self._warm = True
 
     def _excluded_save_params(self) -> list[str]:
@@ -163,6 +167,7 @@ def capture(model: Resumable) -> dict[str, Any]:
         "last_original_obs": model._last_original_obs,
         "unstored_step": _unstored_step(model),
         "warm": model._warm,
+        "learner": model.snapshots.get("learner"),
     }
 
 

@@ -72,7 +72,7 @@ class LoopCloser:
         self.stale = False
         #: whether phi is what a trace of noisy transitions made it
         self.keeps_phi = False
-        #: whether the last trace accounts for the target, so that the simulator may judge policies
+        #: whether the simulator accounts for the target by the last trace, so that it may judge policies
         self.accounts = False
         #: of the policy in the simulator as it is fitted
         self.rehearsals = Rehearsals()
@@ -152,9 +152,10 @@ class LoopCloser:
             self.rehearsals.take_up_learner(model)
 
     def finish(self, model: Looping) -> None:
-        """After the rounds: where the target is a log the last policy is yet to be judged."""
-        if model._offline and self.may_judge(model):
-            self.rehearse(model)
+        """After the rounds: learn what is still owed, judge the last policy, and let the best one act."""
+        if self.may_judge(model):
+            if model._owed or self.rehearsals.is_behind(model):
+                self._learn_what_is_owed(model)
             self.rehearsals.leave_best(model)
 
     def renew(self, model: Looping) -> None:
@@ -165,7 +166,7 @@ class LoopCloser:
         if self.stale:
             model.snapshots.pop(LEARNER, None)  # of the simulator that is dropped
             renew_source(model)
-            if not model._offline:
+            if not model._offline and model.updates_per_step:
                 learn_in_source(model, lambda: self.rehearse(model))
                 if self.may_judge(model):
                     self.rehearsals.go_back(model)
@@ -182,24 +183,40 @@ class LoopCloser:
             self.rehearsals.rehearse(model, model.dynamics)
 
     def watch(self, model: Looping) -> None:
-        """Where enough is owed or was learned: learn what target steps pay for, rehearse, and let the best policy act.
+        """Where enough is owed or was learned since the last rehearsal, learn, rehearse, and let the best policy act.
 
         With a log for a target the policy acts in the simulator alone, and goes on unless it clearly got worse.
         """
-        judges = self.may_judge(model)
-        if judges and not self.rehearsals.due(model):
-            return
-        if model._owed:
-            self.rehearsals.take_up_learner(model)
-        for _ in range(model._owed):
-            learn_for_a_step(model)
-        model._owed = 0
-        if judges:
-            self.rehearse(model)
+        if not self.may_judge(model):
+            if model._owed:  # the last trace has taken the simulator's word away
+                self._learn_what_is_owed(model)
+        elif self.rehearsals.due(model._n_updates + model._owed * model.updates_per_step):
+            self._learn_what_is_owed(model)
             if not model._offline:
                 self.rehearsals.leave_best(model)
-            elif self.rehearsals.clearly_worse():
-                self.rehearsals.go_back(model)
+
+    def _learn_what_is_owed(self, model: Looping) -> None:
+        """Learn what target steps have paid for, and judge what comes of it; where interrupted, it goes on later."""
+        judges = self.may_judge(model)
+        if model._owed:
+            self.rehearsals.take_up_learner(model)
+        try:
+            while model._owed:
+                learn_for_a_step(model)
+                model._owed -= 1
+                if judges and model._owed and self.rehearsals.due(model._n_updates):
+                    self._judge(model)
+            if judges:
+                self._judge(model)
+        except BaseException:
+            if judges and not model._offline:
+                self.rehearsals.set_aside(model)
+            raise
+
+    def _judge(self, model: Looping) -> None:
+        self.rehearse(model)
+        if self.rehearsals.clearly_worse():
+            self.rehearsals.go_back(model)
 
     def _trace(
         self, model: Looping, dynamics: PhysicalDynamics, measured: Measurements, horizon: float | None
@@ -253,9 +270,11 @@ class LoopCloser:
                 "is kept; give bounds to what you declare",
                 stacklevel=4,
             )
+            self.accounts = False
             return []
         if before < math.inf and not dynamics.error(data) < (WORTH if new else 1.0) * before:
             dynamics.replace(*kept)
+            self.accounts &= not new  # what it lacks is known, and it goes on lacking it
             return []
         self.keeps_phi = dynamics.observation_noise is not None
         assert model.dynamics_config is not None

@@ -21,8 +21,8 @@ class Looping(Resumable):
     close_loop: bool | Sequence[str]
     #: the robot's log, where one was given
     measured: Measurements | None
-    #: target steps for which the policy has not learned yet
-    _owed: int = 0
+    #: step 3 of a round is done, its steps 5 and 6 are not
+    _round_open: bool
 
     def learns_at_fits(self) -> bool:
         """Whether steps 3 and 5 wait for the next fit."""
@@ -32,6 +32,7 @@ class Looping(Resumable):
         """Steps 5 and 6, or the latter's fit alone where the policy learns at fits."""
         if self.learns_at_fits():
             self._owed += self._collected
+            self._round_open = False  # nothing is left to make up for, whatever interrupts a fit
             self.fit_dynamics()
         else:
             super().update()

@@ -21,17 +21,18 @@ EVERY = 2_000
 #: Name of the snapshot that goes on learning, while a better policy acts.
 LEARNER = "learner"
 #: A policy that earns less than the best by more than this share, and by more than the standard error of what the best
-#: earned, is given up for it: an early fall in one of all episodes is enough.
+#: earned, learns no further, and the best one does: an early fall in one of all episodes is enough.
 LOST = 0.03
 #: What was earned counts no longer when a number of the simulator has moved by this share of its scale.
 MOVED = 1e-3
 
 
 class Rehearsals:
-    """Lets the deterministic policy play in the fitted simulator, and goes back to the best one where it got worse.
+    """Lets the deterministic policy play in the fitted simulator, and knows the best one so far.
 
-    Warm-started SAC that learns on from what a good policy sees may get worse, which the simulator tells for nothing.
-    The first policy to be beaten is the one that came from the source. The best is ``snapshots["simulator"]``.
+    Warm-started SAC that learns on from what a good policy sees may get worse, and swings from one update to the next,
+    which the simulator tells for nothing. The first policy to be beaten is the one that came from the source. The best
+    is ``snapshots["simulator"]``; where it acts, the one that learns waits as ``snapshots["learner"]``.
     """
 
     def __init__(self) -> None:
@@ -44,14 +45,19 @@ class Rehearsals:
         self._names: list[str] = []
         self._at_update = -np.inf  # the first one as soon as the simulator accounts for the target
 
-    def due(self, model: Looping) -> bool:
-        """Whether the policy has learned enough since the last one, or will with what is owed."""
-        return model._n_updates + model._owed * model.updates_per_step - self._at_update >= EVERY
+    def due(self, updates: int) -> bool:
+        """Whether a policy after so many updates has learned enough since the last one."""
+        return updates - self._at_update >= EVERY
+
+    def is_behind(self, model: Looping) -> bool:
+        """Whether the policy has learned since the last one."""
+        return model._n_updates > self._at_update
 
     def rehearse(self, model: Looping, dynamics: PhysicalDynamics) -> None:
         """Play, and keep the policy if it is the best so far."""
         self._at_update = model._n_updates
-        if self._has_moved(dynamics):
+        normaliser = model.get_vec_normalize_env()  # where its statistics move, so does what the best one earns
+        if self._has_moved(dynamics) or (normaliser is not None and normaliser.training):
             self._rehearse_best(model, dynamics)
         returns = self._play(model, dynamics)
         self.last = float(returns.mean())
@@ -73,14 +79,17 @@ class Rehearsals:
             self.last = self.best
 
     def leave_best(self, model: Looping) -> None:
-        """Let the best policy act; the last one is kept to go on learning, unless it clearly got worse."""
+        """Let the best policy act, unless the last one is, which is kept to go on learning."""
         if self.last < self.best:
-            if not self.clearly_worse():
-                model.take_snapshot(LEARNER)
-            learner = model.snapshots.get(LEARNER)
-            self.go_back(model)
-            if learner is not None:
-                model.snapshots[LEARNER] = learner
+            self.set_aside(model)
+
+    def set_aside(self, model: Looping) -> None:
+        """Keep the present policy to go on learning, and let the best one act."""
+        model.take_snapshot(LEARNER)
+        learner = model.snapshots[LEARNER]
+        if "simulator" in model.snapshots:  # not so before the first rehearsal
+            model.rollback("simulator")
+        model.snapshots[LEARNER] = learner
 
     def take_up_learner(self, model: Looping) -> None:
         """Go on with the policy that learns, where another one acts."""

@@ -78,8 +78,6 @@ class TransferAlgorithm(Looping):
     _passed: frozenset[str]
     #: ``num_timesteps`` where the target rollout under way began
     _rollout_began_at: int
-    #: step 3 of a round is done, its steps 5 and 6 are not
-    _round_open: bool
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         """Remember which arguments the user passed: a preset fills in only the others."""
@@ -357,7 +355,7 @@ class TransferAlgorithm(Looping):
             if not self.interact_with_target(callback, log_interval):  # step 4
                 break
             self._end_round()
-        if self.loop is not None:
+        if self.loop is not None and self._steps_left() <= 0:
             self.loop.finish(self)
         callback.on_training_end()
         self._callback = None
@@ -372,7 +370,8 @@ class TransferAlgorithm(Looping):
 
         :param forget: a new run begins, and owes nothing
         """
-        self._round_open &= not forget
+        if forget:
+            self._round_open, self._owed = False, 0
         if self._round_open and not self._offline:
             taken = self.num_timesteps - self._rollout_began_at
             if not taken:

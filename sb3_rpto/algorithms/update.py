@@ -190,7 +190,7 @@ class RelativeUpdate(SAC):
         """After a fit: trace what the simulator lacks, where that was asked for and is due."""
 
     def _rehearse(self) -> None:
-        """After a fit: go back to a better policy, where a closed loop has one."""
+        """After a fit: learn what was put off until then, where a closed loop judges what comes of it."""
 
     def _doubt_the_target(self, error: float) -> None:
         """After a fit that left this one-step error: say once what speaks against the target."""

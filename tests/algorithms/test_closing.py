@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import chain, repeat
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +21,7 @@ from stable_baselines3.common.logger import configure
 from sb3_rpto import RPTO
 from sb3_rpto.algorithms import closing
 from sb3_rpto.algorithms.closing import LoopCloser, outdated, stays_finite
+from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
@@ -347,6 +350,19 @@ def test_an_unstable_correction_is_refused(soon: None, monkeypatch: pytest.Monke
     with pytest.warns(UserWarning, match=r"coulomb_friction\(slider\).*unstable: refused"):
         made.loop.close(made, dynamics(made))
     assert dynamics(made).describe() == before
+    assert not made.loop.accounts  # the simulator lacks what was found
+
+
+def test_what_does_not_lower_the_error_is_refused_and_the_simulator_judges_nothing(
+    soon: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(closing, "WORTH", 0.0)
+    made = filled(friction())
+    assert made.loop is not None
+    made.loop.close(made, dynamics(made))
+    assert made.loop.found[-1]["verdict"] == "explained"
+    assert dynamics(made).names == ["pole.length"]
+    assert not made.loop.accounts
 
 
 @pytest.mark.parametrize("seen", [30, 0])
@@ -657,31 +673,142 @@ def test_what_is_owed_is_learned_by_the_policy_that_goes_on_learning(
     begun: list[np.ndarray] = []
     monkeypatch.setattr(made, "train", lambda *_: begun.append(weights(made)))
     made._owed = 3
+    monkeypatch.setattr(made.loop.rehearsals, "due", lambda updates: updates > made._n_updates)
     made.loop.watch(made)
     np.testing.assert_array_equal(begun, [wanted[goes_on]] * 3)
     np.testing.assert_array_equal(weights(made), wanted["best"])
     assert made._owed == 0
 
 
-def test_between_fits_the_policy_stays_as_the_simulator_judged_it(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_rpto.algorithms.rehearsals.EVERY", 40)
+class Watch(BaseCallback):
+    """Sees at each target step how many updates there were, and which policy acts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.updates: list[int] = []
+        self.acting: list[float] = []
+
+    def _on_step(self) -> bool:
+        self.updates.append(self.model._n_updates)
+        self.acting.append(float(weights(self.model).sum()))  # type: ignore[arg-type]
+        return True
+
+
+def judged(monkeypatch: pytest.MonkeyPatch, every: int = 40, earns: Callable[[], float] = lambda: 1.0) -> RPTO:
+    """A model whose simulator judges a policy of so many updates, and finds it to earn what is told."""
+    monkeypatch.setattr("sb3_rpto.algorithms.rehearsals.EVERY", every)
+    monkeypatch.setattr(Rehearsals, "_play", lambda *_: np.full(25, earns()))
+    monkeypatch.setattr(LoopCloser, "due", lambda *_: False)
     made = forgetful()
-    assert made.loop is not None
-    monkeypatch.setattr(made.loop, "due", lambda *_: False)
-    monkeypatch.setattr(made.loop.rehearsals, "_play", lambda *_: np.full(25, 1.0))
-    updates, source, acts, at = made._n_updates, made.source_timesteps, weights(made), made.num_timesteps
-
-    class Watch(BaseCallback):
-        def _on_step(self) -> bool:
-            seen.append((made.num_timesteps - at, made._n_updates - updates, bool((weights(made) == acts).all())))
-            return True
-
-    seen: list[tuple[int, int, bool]] = []
     made._since_fit = 0
-    made.learn(50, callback=Watch(), reset_num_timesteps=False)
-    assert [(done, same) for _, done, same in seen] == [(0, True)] * 40 + [(40, False)] * 10
-    assert made.source_timesteps - source == 4 * 40  # rehearsals are scripted
-    assert made._owed == 10
+    return made
+
+
+def test_between_fits_the_policy_stays_as_the_simulator_judged_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, seen = judged(monkeypatch), Watch()
+    updates, source = made._n_updates, made.source_timesteps
+    made.learn(130, callback=seen, reset_num_timesteps=False)
+    assert [n - updates for n in seen.updates] == [0] * 40 + [40] * 40 + [80] * 40 + [120] * 10
+    assert [len(set(seen.acting[i : i + 40])) for i in (0, 40, 80, 120)] == [1, 1, 1, 1]
+    assert len(set(seen.acting)) == 4
+    # What is owed in the end is learned, too.
+    assert (made._n_updates - updates, made._owed) == (130, 0)
+    assert made.source_timesteps - source == 4 * 130  # rehearsals are scripted
+
+
+def test_policies_are_rehearsed_on_the_way_where_much_is_owed(monkeypatch: pytest.MonkeyPatch) -> None:
+    at: list[int] = []
+    made = judged(monkeypatch, every=10, earns=lambda: at.append(made._n_updates) or 1.0)  # type: ignore[func-returns-value]
+    assert made.loop is not None
+    made.loop.watch(made)
+    at.clear()
+    updates, made._owed = made._n_updates, 34
+    made.loop.watch(made)
+    assert [n - updates for n in at] == [10, 20, 30, 34]
+
+
+def test_a_judged_policy_that_was_stopped_goes_on_as_if_it_had_not_been(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    # That of the source, the first one, which is the best, and all later ones.
+    earned = chain([50.0, 100.0], repeat(99.0))
+    unbroken = judged(monkeypatch, earns=lambda: next(earned))
+    monkeypatch.setattr(Rehearsals, "_has_moved", lambda self, _: self._phi is None)
+    at = unbroken.num_timesteps + 95
+    unbroken.learn(200, callback=lambda *_: unbroken.num_timesteps < at, reset_num_timesteps=False)
+    unbroken.save(tmp_path / "model")
+    unbroken.save_replay_buffer(tmp_path / "buffer")
+
+    def end(made: RPTO) -> np.ndarray:
+        assert made._owed == 14  # the round of the last step is open
+        assert "learner" in made.snapshots
+        made.learn(60, reset_num_timesteps=False)
+        assert made._owed == 0
+        acting = weights(made)
+        made.rollback("learner")
+        assert not np.array_equal(acting, weights(made))
+        return np.array([made._n_updates, *acting, *weights(made)])
+
+    goes_on = end(unbroken)
+    resumed = RPTO.load(tmp_path / "model", env=gym.make(TASK), target_env=target([]), device="cpu")
+    resumed.load_replay_buffer(tmp_path / "buffer")
+    np.testing.assert_array_equal(end(resumed), goes_on)
+
+
+def test_a_judged_policy_acts_where_learning_was_interrupted_and_nothing_is_learned_twice(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = judged(monkeypatch)
+    made.learn(80, reset_num_timesteps=False)
+    updates, acting, train = made._n_updates, weights(made), made.train
+    left = iter(range(30))
+
+    def interrupted(steps: int, batch_size: int) -> None:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        train(steps, batch_size)
+
+    monkeypatch.setattr(made, "train", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        made.learn(40, reset_num_timesteps=False)
+    np.testing.assert_array_equal(weights(made), acting)
+    assert (made._n_updates - updates, made._owed) == (30, 10)
+    monkeypatch.setattr(made, "train", train)
+    begun: list[np.ndarray] = []
+    learn = closing.learn_for_a_step
+    monkeypatch.setattr(closing, "learn_for_a_step", lambda m: begun.append(weights(m)) or learn(m))  # type: ignore[func-returns-value]
+    made.learn(40, reset_num_timesteps=False)
+    assert (made._n_updates - updates, made._owed) == (80, 0)
+    assert not np.array_equal(begun[0], acting)  # the one that was interrupted
+
+
+def test_parameters_that_a_user_sets_go_on_learning(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = forgetful()
+    made.take_snapshot("learner")
+    made.set_parameters(made.get_parameters())
+    assert "learner" not in made.snapshots
+
+
+def test_another_target_is_owed_nothing() -> None:
+    made = forgetful()
+    made._owed = 30
+    made.take_snapshot("learner")
+    with pytest.warns(UserWarning, match="D_target loses"):
+        made.set_target_env(target(friction()))
+    assert made._owed == 0
+    assert "learner" not in made.snapshots
+
+
+def test_what_is_owed_is_learned_where_a_new_trace_no_longer_accounts_for_the_target(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = judged(monkeypatch)
+    made.learn(20, reset_num_timesteps=False, callback=lambda *_: made._owed < 10)
+    assert made.loop is not None
+    updates, owed = made._n_updates, made._owed
+    made.loop.accounts = False
+    made.loop.watch(made)
+    assert (owed, made._n_updates - updates, made._owed) == (10, 10, 0)
 
 
 @pytest.mark.parametrize("accounts", [True, False])
