@@ -281,10 +281,14 @@ def test_deviation():
 
 
 def result(id="single-coulomb_friction-small-pendulum-1mrad", named=(), error=None, after=1.0, **changes):
-    """A result as it is stored: named is (label, alike, values)."""
+    """A result as it is stored: named is (label, alike, values), with intervals of 20 % to both sides."""
     case = CASES[id]
     effects = [
-        {"label": label, "alike": list(alike), "parameters": {k: {"value": v} for k, v in values.items()}}
+        {
+            "label": label,
+            "alike": list(alike),
+            "parameters": {k: {"value": v, "low": 0.8 * v, "high": 1.2 * v} for k, v in values.items()},
+        }
         for label, alike, values in named
     ]
     made = {
@@ -327,6 +331,21 @@ def test_right_answer():
     assert not weak.measures["error reduction"]
     blind = only(result(named=[RIGHT], errors=result()["errors"] | {"true": {"hinge": 4.9}}))
     assert blind.measures["error reduction"] is None, "nothing to take away"
+
+
+def test_intervals_of_what_is_named_itself_are_to_hold_the_truth():
+    def holds(named, **changes):
+        return only(result(named=named, **changes)).measures["intervals"]
+
+    assert holds([RIGHT])
+    assert not holds([("coulomb_friction(hinge)", (), {"level": 0.13})])
+    assert holds([("stribeck_friction(hinge)", ["coulomb_friction(hinge)"], {"level": 0.1})]) is None
+    assert holds([("coulomb_friction(hinge)", (), {"level": np.nan})]) is None, "no interval is known"
+    two = {"coulomb_friction(hinge)": {"level": 0.1}, "command_delay(motor)": {"delay": 0.01}}
+    late = ("command_delay(motor)", (), {"delay": 0.02})
+    assert not holds([RIGHT, late], planted=two)
+    turned = {"position_friction(hinge)": {"amplitude": 0.1, "phase": 1.0}}
+    assert holds([("position_friction(hinge)", (), {"amplitude": 0.2, "phase": 1.0})], planted=turned) is None
 
 
 def test_another_of_its_class_is_right_and_not_itself():

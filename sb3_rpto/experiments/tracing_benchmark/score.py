@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_rpto.experiments.tracing_benchmark.truth import UNIDENTIFIABLE, deviation, kind_of, twins
+from sb3_rpto.experiments.tracing_benchmark.truth import UNIDENTIFIABLE, VECTORS, deviation, kind_of, twins
 
 Result = dict[str, Any]
 
@@ -25,6 +25,7 @@ MEASURES = {
     "planted named": "the same, but more may be named",
     "itself": "each planted effect is named itself, and nothing else",
     "values": f"planted effects are named themselves, with values within {WITHIN:.0%}",
+    "intervals": "the 95 % intervals of planted effects that are named themselves all hold the planted values",
     "error reduction": f"at least {ENOUGH:.0%} of the error is taken away that the true structure, fitted, takes away",
     "says explained": "the verdict is explained",
     "nothing named": "no effect is named",
@@ -33,7 +34,7 @@ MEASURES = {
     "not explained": "the verdict is not explained",
     "says so": "the verdict is unexplained or partly explained",
 }
-_FOUND = ("right class", "planted named", "itself", "values", "error reduction", "says explained")
+_FOUND = ("right class", "planted named", "itself", "values", "intervals", "error reduction", "says explained")
 APPLY = {
     "complete": ("nothing named", "says complete"),
     "single": _FOUND,
@@ -152,6 +153,7 @@ def judge(result: Result) -> Row:
         "planted named": not missed,
         "itself": set(planted) == set(named),
         "values": None if off is None else off <= WITHIN,
+        "intervals": _held(result, named, found),
         "error reduction": None if share is None else share >= ENOUGH,
         "says explained": verdict == "explained",
         "nothing named": not named,
@@ -209,6 +211,23 @@ def _deviation(result: Result, named: dict[str, Any], found: dict[str, str]) -> 
         fitted = {name: p["value"] for name, p in named[label]["parameters"].items()}
         worst.append(deviation(kind, true, fitted))
     return max(worst, default=None)
+
+
+def _held(result: Result, named: dict[str, Any], found: dict[str, str]) -> bool | None:
+    """Whether all intervals that are known hold the planted value; None where there is none to compare with one.
+
+    Effects whose values are told only together (a phase, a direction) are left out.
+    """
+    held = []
+    for label, values in result["planted"].items():
+        kind = kind_of(label)
+        apart = kind not in VECTORS and (result["case"]["system"], kind) not in UNIDENTIFIABLE
+        if values is None or found.get(label) != label or not apart:
+            continue
+        for name, p in named[label]["parameters"].items():
+            if name in values and math.isfinite(p["low"]) and math.isfinite(p["high"]):
+                held.append(p["low"] <= values[name] <= p["high"])
+    return all(held) if held else None
 
 
 def _reduction(result: Result) -> float | None:

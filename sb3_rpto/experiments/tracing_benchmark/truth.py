@@ -76,7 +76,7 @@ TWINS: tuple[tuple[str, frozenset[str], str], ...] = (
 UNIDENTIFIABLE = {("pendulum", "payload")}
 """Machines and effects whose class can be found but not its values: mass and place of the payload make one number."""
 
-_VECTORS: dict[str, Callable[[Mapping[str, float]], list[float]]] = {
+VECTORS: dict[str, Callable[[Mapping[str, float]], list[float]]] = {
     "position_friction": lambda v: [v["amplitude"] * np.cos(v["phase"]), v["amplitude"] * np.sin(v["phase"])],
     "torque_ripple": lambda v: [v["sine"], v["cosine"]],
     "stribeck_friction": lambda v: [v["level"], v["level"] + v["extra"]],
@@ -190,8 +190,8 @@ def deviation(kind: str, true: Mapping[str, float], found: Mapping[str, float]) 
 
     Parameters of shape are not compared, nor those that are at their null value in truth.
     """
-    if kind in _VECTORS:
-        t, f = (np.array(_VECTORS[kind](v)) for v in (true, found))
+    if kind in VECTORS:
+        t, f = (np.array(VECTORS[kind](v)) for v in (true, found))
         return float(np.linalg.norm(f - t) / np.linalg.norm(t))
     compared = [p.name for p in LIBRARY[kind].parameters if not p.shape and true[p.name] != p.null]
     return max(abs(found[name] / true[name] - 1) for name in compared)
