@@ -940,7 +940,8 @@ def test_a_rehearsal_plays_the_deterministic_policy_in_the_fitted_simulator(monk
     assert rehearsals.last == pytest.approx(np.mean(returns), rel=1e-3)
     # That of the source, the same one here, played too.
     assert made.source_timesteps - before == rehearsals.steps == 2 * steps
-    assert not rehearsals.due(made)
+    assert not rehearsals.due(made._n_updates)
+    assert not rehearsals.is_behind(made)
 
 
 def test_a_reward_that_is_no_number_is_said_in_a_rehearsal_too(monkeypatch: pytest.MonkeyPatch) -> None:
