@@ -215,12 +215,11 @@ def _many_updates(ensemble: float, alone: float) -> tuple[Variant, ...]:
     )
 
 
-RESIDUAL = {"dynamics": "residual", "declared": list(LENGTHS)}
-RESIDUALS = (Variant("rpto-residual", "rpto", RESIDUAL, 5, 400), Variant("rto-residual", "rto", RESIDUAL, 5, 200))
+RESIDUAL = Variant("rpto-residual", "rpto", {"dynamics": "residual", "declared": list(LENGTHS)}, 5, 400)
 FURTHER = Suite(
     "further",
     "what quick leaves out: 20 updates a target step, with the learned model and without; the residual model",
-    _small_places(_many_updates(200, 80), (*_many_updates(250, 200), *RESIDUALS)),
+    _small_places(_many_updates(200, 80), (*_many_updates(250, 200), RESIDUAL)),
 )
 
 _TINY = {"policy_kwargs": {"net_arch": [16]}, "learning_starts": 50}
