@@ -36,7 +36,7 @@ class Rehearsals:
     """
 
     def __init__(self) -> None:
-        #: mean returns of the best policy and of the last one
+        #: mean returns of the best policy, and of the last one as long as it acts
         self.best = self.last = -np.inf
         self._error = 0.0  # standard error of the best one's
         #: taken so far, of the source's
@@ -90,6 +90,7 @@ class Rehearsals:
         if "simulator" in model.snapshots:  # not so before the first rehearsal
             model.rollback("simulator")
         model.snapshots[LEARNER] = learner
+        self.last = self.best
 
     def take_up_learner(self, model: Looping) -> None:
         """Go on with the policy that learns, where another one acts."""

@@ -716,6 +716,16 @@ def test_between_fits_the_policy_stays_as_the_simulator_judged_it(monkeypatch: p
     assert made.source_timesteps - source == 4 * 130  # rehearsals are scripted
 
 
+def test_the_end_of_learning_leaves_the_learner_where_nothing_is_owed(monkeypatch: pytest.MonkeyPatch) -> None:
+    earned = chain([50.0, 100.0], repeat(99.0))
+    made = judged(monkeypatch, earns=lambda: next(earned))
+    monkeypatch.setattr(Rehearsals, "_has_moved", lambda self, _: self._phi is None)
+    made.learn(80, reset_num_timesteps=False)  # ends with a fit
+    acting = weights(made)
+    made.rollback("learner")
+    assert not np.array_equal(acting, weights(made))
+
+
 def test_policies_are_rehearsed_on_the_way_where_much_is_owed(monkeypatch: pytest.MonkeyPatch) -> None:
     at: list[int] = []
     made = judged(monkeypatch, every=10, earns=lambda: at.append(made._n_updates) or 1.0)  # type: ignore[func-returns-value]
