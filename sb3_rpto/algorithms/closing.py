@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms import warm
-from sb3_rpto.algorithms.rehearsals import LEARNER, Rehearsals
+from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
@@ -164,7 +164,7 @@ class LoopCloser:
         Where that is interrupted it is done when the run goes on.
         """
         if self.stale:
-            model.snapshots.pop(LEARNER, None)  # of the simulator that is dropped
+            model.snapshots.pop("learner", None)  # of the simulator that is dropped
             renew_source(model)
             if not model._offline and model.updates_per_step:
                 learn_in_source(model, lambda: self.rehearse(model))

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 EPISODES, LONGEST, SEED = 25, 1_000, 30_000
 #: Updates of the policy between two rehearsals.
 EVERY = 2_000
-#: Name of the snapshot that goes on learning, while a better policy acts.
-LEARNER = "learner"
 #: A policy that earns less than the best by more than this share, and by more than the standard error of what the best
 #: earned, learns no further, and the best one does: an early fall in one of all episodes is enough.
 LOST = 0.03
@@ -85,17 +83,17 @@ class Rehearsals:
 
     def set_aside(self, model: Looping) -> None:
         """Keep the present policy to go on learning, and let the best one act."""
-        model.take_snapshot(LEARNER)
-        learner = model.snapshots[LEARNER]
+        model.take_snapshot("learner")
+        learner = model.snapshots["learner"]
         if "simulator" in model.snapshots:  # not so before the first rehearsal
             model.rollback("simulator")
-        model.snapshots[LEARNER] = learner
+        model.snapshots["learner"] = learner
         self.last = self.best
 
     def take_up_learner(self, model: Looping) -> None:
         """Go on with the policy that learns, where another one acts."""
-        if LEARNER in model.snapshots:
-            model.rollback(LEARNER)
+        if "learner" in model.snapshots:
+            model.rollback("learner")
 
     def _rehearse_best(self, model: Looping, dynamics: PhysicalDynamics) -> None:
         """The best policy so far, in the simulator as it is now; in the beginning, the one from the source."""
