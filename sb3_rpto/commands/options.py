@@ -36,7 +36,24 @@ def add_common(parser: argparse.ArgumentParser, of_target: str = "") -> None:
         default=[],
         help="an argument of the algorithm, its value in YAML: gradient_steps=5, declared=[pole_length]; repeatable",
     )
+    parser.add_argument("--device", type=device, default="auto", help="cpu, cuda or auto (default)")
     parser.add_argument("--quiet", action="store_true", help="print the result alone")
+
+
+def device(text: str) -> str:
+    """A device that torch can use, by its name; ``auto`` is the GPU where there is one.
+
+    :raises argparse.ArgumentTypeError: for a name that torch does not know, and a GPU that is not there
+    """
+    import torch as th
+
+    if text == "auto":
+        return text
+    try:
+        th.empty(0, device=text)
+    except (RuntimeError, AssertionError) as error:  # torch asserts that it was built for CUDA
+        raise argparse.ArgumentTypeError(f"{text!r} cannot be used ({str(error).splitlines()[0]})") from error
+    return text
 
 
 def setting(text: str) -> tuple[str, Any]:

@@ -36,7 +36,6 @@ def add(commands: Any) -> None:
     parser.add_argument("task", metavar="TASK", help="Hopper, rpto/Hopper-v0, Pendulum-v1, package:name/Task-v0")
     options.add_common(parser)
     parser.add_argument("--until", metavar="RETURN", type=float, help="end early, at an evaluation that reaches this")
-    parser.add_argument("--device", default="auto", help="cpu, cuda or auto (default)")
     parser.set_defaults(run=run)
 
 

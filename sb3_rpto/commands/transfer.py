@@ -107,6 +107,7 @@ def run(parsed: argparse.Namespace) -> int:
         parsed.seed,
         source_data=parsed.source_data,
         kwargs=settings,
+        device=parsed.device,
     )
     curve = SavedCurve(
         folder,
@@ -199,8 +200,8 @@ def _go_on(checkpoint: Path, given: Run, curve: SavedCurve) -> None:
 
     if issubclass(algorithm_of(checkpoint), TransferAlgorithm):
         source = make_vec_env(given.make_source, n_envs=given.n_source_envs)
-        model = load_checkpoint(checkpoint, source, target_env=given.make_target())
+        model = load_checkpoint(checkpoint, source, given.device, target_env=given.make_target())
     else:
-        model = load_checkpoint(checkpoint, given.make_target())
+        model = load_checkpoint(checkpoint, given.make_target(), given.device)
     curve.restore(checkpoint)
     model.learn(given.budget - model.num_timesteps, callback=curve, reset_num_timesteps=False)

@@ -28,15 +28,18 @@ from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics
 CRITIC_STEPS = 2_000
 
 
-def fine_tuned_sac(source_model: str | pathlib.Path, target: GymEnv, seed: int, **settings: Any) -> SAC:
+def fine_tuned_sac(
+    source_model: str | pathlib.Path, target: GymEnv, seed: int, device: str = "cpu", **settings: Any
+) -> SAC:
     """SAC-warm: the source's SAC, ready to go on in the target from its first step, with an empty replay buffer.
 
     :param source_model: zip of the SAC that was trained in the source
     :param target: the target
     :param seed: of the run
+    :param device: to learn on
     :param settings: attributes to change, e.g. ``gradient_steps``
     """
-    model = SAC.load(source_model, env=target, device="cpu", **settings)
+    model = SAC.load(source_model, env=target, device=device, **settings)
     model.set_random_seed(seed)
     model.learning_starts = 0
     return model
@@ -64,7 +67,12 @@ def source_transitions(
 
 
 def with_more_critics(
-    source_model: str | pathlib.Path, target: gym.Env, seed: int, n_critics: int, data: dict[str, np.ndarray]
+    source_model: str | pathlib.Path,
+    target: gym.Env,
+    seed: int,
+    n_critics: int,
+    data: dict[str, np.ndarray],
+    device: str = "cpu",
 ) -> SAC:
     """SAC-warm with more critics than the source model had, as methods with many updates a step use them.
 
@@ -76,19 +84,20 @@ def with_more_critics(
     :param seed: of the run
     :param n_critics: how many there shall be, at least as many as there are
     :param data: source transitions
+    :param device: to learn on
     :raises ValueError: for fewer critics than the source model has
     """
-    source = fine_tuned_sac(source_model, target, seed)
+    source = fine_tuned_sac(source_model, target, seed, device)
     old = source.critic.q_networks
     if n_critics < len(old):
         raise ValueError(f"n_critics must be at least the source model's {len(old)}, got {n_critics}")
-    settings = {**warm.carried_arguments(source), "learning_starts": 0, "seed": seed, "device": "cpu"}
+    settings = {**warm.carried_arguments(source), "learning_starts": 0, "seed": seed, "device": device}
     settings["policy_kwargs"] = {**settings["policy_kwargs"], "n_critics": n_critics}
     model = SAC("MlpPolicy", target, **settings)
     model.actor.load_state_dict(source.actor.state_dict())
     if model.log_ent_coef is not None and source.log_ent_coef is not None:
         model.log_ent_coef.data.copy_(source.log_ent_coef.data)
-    inputs = th.as_tensor(np.concatenate([data["observations"], data["actions"]], axis=1)).float()
+    inputs = th.as_tensor(np.concatenate([data["observations"], data["actions"]], axis=1), device=model.device).float()
     for i, network in enumerate(model.critic.q_networks):
         teacher = old[i % len(old)]
         if i < len(old):
@@ -124,7 +133,12 @@ class MixedReplayBuffer(DualReplayBuffer):
 
 
 def mixed_sac(
-    source_model: str | pathlib.Path, target: gym.Env, seed: int, data: dict[str, np.ndarray], **settings: Any
+    source_model: str | pathlib.Path,
+    target: gym.Env,
+    seed: int,
+    data: dict[str, np.ndarray],
+    device: str = "cpu",
+    **settings: Any,
 ) -> SAC:
     """SAC-warm that learns from source and target transitions half and half.
 
@@ -132,9 +146,10 @@ def mixed_sac(
     :param target: the target
     :param seed: of the run
     :param data: source transitions
+    :param device: to learn on
     :param settings: attributes to change
     """
-    model = fine_tuned_sac(source_model, target, seed, **settings)
+    model = fine_tuned_sac(source_model, target, seed, device, **settings)
     check_spaces(model.observation_space, model.action_space)
     assert isinstance(model.observation_space, spaces.Box)  # as just checked
     assert isinstance(model.action_space, spaces.Box)
@@ -159,7 +174,13 @@ def rollout_length(budget: int, longest: int) -> int:
 
 
 def cloned_trpo(
-    source_model: str | pathlib.Path, target: gym.Env, seed: int, budget: int, states: np.ndarray, **settings: Any
+    source_model: str | pathlib.Path,
+    target: gym.Env,
+    seed: int,
+    budget: int,
+    states: np.ndarray,
+    device: str = "cpu",
+    **settings: Any,
 ) -> Any:
     """TRPO-warm: ``sb3_contrib.TRPO`` that starts from a clone of the source's SAC policy.
 
@@ -168,12 +189,13 @@ def cloned_trpo(
     :param seed: of the run
     :param budget: target steps, a multiple of ``n_steps``; by default 2048, for small budgets a quarter
     :param states: of the source, (n, observation_dim)
+    :param device: to learn on
     :param settings: arguments of TRPO
     :raises ValueError: for a budget that is no multiple of ``n_steps``: TRPO would overspend it
     """
     from sb3_contrib import TRPO  # an extra
 
-    teacher = SAC.load(source_model, device="cpu")
+    teacher = SAC.load(source_model, device=device)
     n_steps = settings.pop("n_steps", None) or rollout_length(budget, min(2048, max(budget // 4, 2)))
     if budget % n_steps:
         raise ValueError(f"n_steps={n_steps} must divide the budget of {budget} target steps, or TRPO overspends it")
@@ -182,7 +204,7 @@ def cloned_trpo(
         "batch_size": rollout_length(n_steps, 128),
         "policy_kwargs": clone_kwargs(teacher),
     }
-    model = TRPO(SquashedMeanPolicy, target, n_steps=n_steps, seed=seed, device="cpu", **{**defaults, **settings})
+    model = TRPO(SquashedMeanPolicy, target, n_steps=n_steps, seed=seed, device=device, **{**defaults, **settings})
     clone(model.policy, teacher, states)
     return model
 

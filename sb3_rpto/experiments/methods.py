@@ -28,7 +28,10 @@ MakeEnv = Callable[[], gym.Env]
 
 @dataclass(frozen=True)
 class Run:
-    """What a method is given; see :func:`~sb3_rpto.experiments.run.transfer`."""
+    """What a method is given; see :func:`~sb3_rpto.experiments.run.transfer`.
+
+    :param device: to learn on; runs side by side are quickest on the CPU
+    """
 
     source_model: str
     make_source: MakeEnv
@@ -38,6 +41,7 @@ class Run:
     n_source_envs: int = 1
     source_data: str | None = None
     kwargs: dict[str, Any] = field(default_factory=dict)
+    device: str = "cpu"
 
     def source_id(self) -> str | None:
         """The source's id, None where it has none."""
@@ -68,7 +72,7 @@ class Method:
 
 
 def _zero_shot(run: Run, curve: LearningCurve) -> None:
-    curve.begin(baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, **run.kwargs))
+    curve.begin(baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, **run.kwargs))
 
 
 def two_worlds(cls: type[TransferAlgorithm], run: Run, curve: LearningCurve) -> None:
@@ -76,7 +80,7 @@ def two_worlds(cls: type[TransferAlgorithm], run: Run, curve: LearningCurve) -> 
     source, kwargs = make_vec_env(run.make_source, n_envs=run.n_source_envs), dict(run.kwargs)
     if cls.updates_dynamics:
         kwargs["source_data"] = run.source_data
-    model = cls.from_source(run.source_model, source, run.make_target(), seed=run.seed, device="cpu", **kwargs)
+    model = cls.from_source(run.source_model, source, run.make_target(), seed=run.seed, device=run.device, **kwargs)
     model.learn(run.budget, callback=curve)
 
 
@@ -86,11 +90,13 @@ def _slbo(run: Run, curve: LearningCurve) -> None:
 
 
 def _sac(run: Run, curve: LearningCurve) -> None:
-    SAC("MlpPolicy", run.make_target(), seed=run.seed, device="cpu", **run.kwargs).learn(run.budget, callback=curve)
+    SAC("MlpPolicy", run.make_target(), seed=run.seed, device=run.device, **run.kwargs).learn(
+        run.budget, callback=curve
+    )
 
 
 def _sac_warm(run: Run, curve: LearningCurve) -> None:
-    model = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, **run.kwargs)
+    model = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, **run.kwargs)
     model.learn(run.budget, callback=curve)
 
 
@@ -98,10 +104,10 @@ def _sac_warm_high(run: Run, curve: LearningCurve) -> None:
     settings = {"gradient_steps": int(_rpto_updates(run.source_id())), **run.kwargs}
     n_critics = settings.pop("n_critics", None)
     if n_critics is None:
-        model = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, **settings)
+        model = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, **settings)
     else:
         data = run.source_transitions(curve)
-        model = baselines.with_more_critics(run.source_model, run.make_target(), run.seed, n_critics, data)
+        model = baselines.with_more_critics(run.source_model, run.make_target(), run.seed, n_critics, data, run.device)
         for name, value in settings.items():
             setattr(model, name, value)
     model.learn(run.budget, callback=curve)
@@ -109,13 +115,15 @@ def _sac_warm_high(run: Run, curve: LearningCurve) -> None:
 
 def _sac_mixed(run: Run, curve: LearningCurve) -> None:
     data = run.source_transitions(curve)
-    model = baselines.mixed_sac(run.source_model, run.make_target(), run.seed, data, **run.kwargs)
+    model = baselines.mixed_sac(run.source_model, run.make_target(), run.seed, data, run.device, **run.kwargs)
     model.learn(run.budget, callback=curve)
 
 
 def _trpo_warm(run: Run, curve: LearningCurve) -> None:
     states = run.source_transitions(curve)["observations"]
-    model = baselines.cloned_trpo(run.source_model, run.make_target(), run.seed, run.budget, states, **run.kwargs)
+    model = baselines.cloned_trpo(
+        run.source_model, run.make_target(), run.seed, run.budget, states, run.device, **run.kwargs
+    )
     model.learn(run.budget, callback=curve)
 
 
@@ -125,14 +133,14 @@ def _sysid_retrain(run: Run, curve: LearningCurve) -> None:
     identification = {name: settings.pop(name) for name in ("max_steps", "dynamics_kwargs") if name in settings}
     if not declared:
         raise ValueError("sysid-retrain needs declared=[...], the names of the simulator's numbers to identify")
-    recorder = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, gradient_steps=0)
+    recorder = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, gradient_steps=0)
     recorder.learn(run.budget, callback=curve)
     assert recorder.replay_buffer is not None  # learn() has filled it
     source = make_vec_env(run.make_source, n_envs=1)
     simulator, _ = baselines.identified_source(
         recorder.replay_buffer, recorder, source, declared, run.seed, **identification
     )
-    model = baselines.fine_tuned_sac(run.source_model, simulator, run.seed, **settings)
+    model = baselines.fine_tuned_sac(run.source_model, simulator, run.seed, run.device, **settings)
     model.learn(retrain_steps)
     curve.source_steps += retrain_steps
     curve.finish(model, run.budget)

@@ -268,6 +268,7 @@ BAD = {
     "train ContinuousCartPole --out O --set gama=1": "--set gama: there is no such argument; did you mean 'gamma'",
     "train ContinuousCartPole --out O --set gamma": "'gamma' is not NAME=VALUE",
     "train ContinuousCartPole --out O --steps 0": "--steps is 0",
+    "train ContinuousCartPole --out O --device gpu": "--device: 'gpu' cannot be used",
     "train ContinuousCartPole --out O --every -1": "--every is -1",
     "train ContinuousCartPole": "--out",
     "transfer absent.zip T --out O": "ZIP: there is no file 'absent.zip'",

@@ -13,14 +13,15 @@ import pytest
 import torch as th
 from conftest import SMALL_ENSEMBLE, SMALL_POLICY
 from stable_baselines3 import SAC
+from stable_baselines3.common import base_class
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_rpto.buffers import chronological
 from sb3_rpto.effects import declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments import baselines
-from sb3_rpto.experiments.methods import REGISTRY
-from sb3_rpto.experiments.run import METHODS, transfer
+from sb3_rpto.experiments.methods import REGISTRY, Run
+from sb3_rpto.experiments.run import METHODS, LearningCurve, transfer
 
 BUDGET, EPISODES = 60, 2
 
@@ -110,6 +111,22 @@ def test_a_method_spends_its_budget_exactly_and_says_what_it_took(method: str, s
         assert all(earlier[name] <= later[name] for earlier, later in pairwise(rows))
     if method != "sac":  # which knows nothing of the source
         assert rows[0]["return"] == pytest.approx(run("zero-shot", source_model)[0]["return"])
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "method", ["rpto", "sac", "sac-warm", "sac-warm-high", "sac-mixed", "trpo-warm", "sysid-retrain"]
+)
+def test_a_method_learns_on_the_device_that_it_is_given(
+    method: str, source_model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    monkeypatch.setattr(base_class, "get_device", lambda device: asked.append(str(device)) or th.device("cpu"))
+    settings = {**SMALL.get(method, {}), **({"n_critics": 3} if method == "sac-warm-high" else {})}
+    run = Run(source_model, cartpole, target, 20, kwargs=settings, device="cuda")
+    REGISTRY[method].run(run, LearningCurve(target, 20, 1))
+    source_transitions = {"sac-warm-high", "sac-mixed", "trpo-warm"}  # are collected on the CPU
+    assert set(asked) == {"cuda"} | ({"cpu"} if method in source_transitions else set())
 
 
 @pytest.mark.filterwarnings("ignore")
