@@ -133,8 +133,9 @@ class Measurements:
     def from_tables(cls, tables: Mapping[str, Table]) -> "Measurements":
         """Check tables of columns in memory and cut them into episodes.
 
-        :param tables: for each file name, its columns, all of shape (T,): ``time`` in s, ``qpos`` in rad or m, ``qvel``
-            in rad/s or m/s, ``qfrc`` in N·m or N, ``ctrl`` in the actuators' units, ``enabled`` 0 or 1, ``param`` in SI
+        :param tables: for each file name its columns of shape (T,), in a dict or a pandas DataFrame: ``time`` in s,
+            ``qpos`` in rad or m, ``qvel`` in rad/s or m/s, ``qfrc`` in N·m or N, ``ctrl`` in the actuators' units,
+            ``enabled`` 0 or 1, ``param`` in SI
         :raises TypeError: a table in the place of a dict of them
         :raises ValueError: no tables; unknown, missing or differing columns, or such of unequal shape; what is no
             number, NaN or infinity; time that does not increase, too few rows; a setting or a split that changes within
