@@ -5,12 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
 
 _FOLDER = resources.files("sb3_rpto") / "hyperparams"
 
@@ -18,19 +15,6 @@ _FOLDER = resources.files("sb3_rpto") / "hyperparams"
 def preset_names() -> list[str]:
     """The shipped presets."""
     return sorted(path.name.removesuffix(".yml") for path in _FOLDER.iterdir() if path.name.endswith(".yml"))
-
-
-def preset_section(backend: str | None, env: VecEnv | None) -> str:
-    """The part of a preset that fits the source's kind.
-
-    :param backend: of the dynamics; None where they are not trained
-    :param env: the source; None before it is known
-    """
-    if backend is None:
-        return "real"
-    # Fits of our own cart-pole's numbers cost nothing.
-    mujoco = backend == "physical" and env is not None and not env.has_attr("parameters")
-    return "mujoco" if mujoco else backend
 
 
 def resolve_preset(preset: str, backend: str, env_id: str | None, passed: Collection[str]) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from collections.abc import Collection, Iterator, Sequence
 from numbers import Integral
 from typing import Any
 
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -22,6 +21,7 @@ from sb3_rpto.effects import LIBRARY, from_json
 from sb3_rpto.effects.library import given
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.names import near
+from sb3_rpto.envs.rules import misfit
 
 #: Arguments that only an algorithm with trainable dynamics has a use for.
 DYNAMICS_ARGUMENTS = frozenset(
@@ -199,16 +199,14 @@ def check_rules(kwargs: dict[str, Any], observation_space: spaces.Space, action_
     :param action_space: both worlds'
     :raises ValueError: naming the rule and what it gave
     """
-    seen, actions = (th.zeros(2, *space.shape) for space in (observation_space, action_space) if space.shape)
     for name in ("reward_fn", "termination_fn"):
         if kwargs.get(name) is None:
             continue
-        answer = kwargs[name](seen, actions, seen)
-        if not isinstance(answer, th.Tensor) or answer.shape != (2,):
-            got = f"a tensor of shape {tuple(answer.shape)}" if isinstance(answer, th.Tensor) else type(answer).__name__
+        found = misfit(kwargs[name], observation_space, action_space)
+        if found is not None:
             raise ValueError(
                 f"dynamics_kwargs[{name!r}] must answer n observations, actions and next observations by a tensor of "
-                f"shape (n,); of two it made {got}"
+                f"shape (n,); of two it made {found}"
             )
 
 
@@ -266,6 +264,12 @@ def _warn_of_little(model: TwoWorlds, total_timesteps: int) -> None:
         warnings.warn(
             f"total_timesteps={total_timesteps} ends before the first fit of the dynamics, after "
             f"{model.model_train_freq} target steps; raise it, or lower model_train_freq",
+            stacklevel=4,
+        )
+    elif model.loop is not None and model.loop.first_comes_after(model) > total_timesteps:
+        warnings.warn(
+            f"total_timesteps={total_timesteps} ends before the closed loop's first trace, for which it waits "
+            f"{model.loop.first_comes_after(model)} target steps; raise it",
             stacklevel=4,
         )
 

@@ -21,7 +21,7 @@ from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_rpto.algorithms.machine import check_machine, doubts
+from sb3_rpto.algorithms.machine import check_machine, check_simulator, doubts
 from sb3_rpto.algorithms.snapshots import PolicySnapshots
 from sb3_rpto.algorithms.source import SourceWorld
 from sb3_rpto.algorithms.worlds import (
@@ -31,6 +31,7 @@ from sb3_rpto.algorithms.worlds import (
     check_finite,
     check_pair,
     find_ledger,
+    raw_terminal,
     share_normalisation,
 )
 from sb3_rpto.dynamics.factory import is_mujoco
@@ -124,7 +125,7 @@ class TwoWorlds(PolicySnapshots):
         venv = self._wrap_env(env, self.verbose)
         if self.env is not None:
             self._check_pair(self.env, venv)
-        if self.target_env is not None:  # what the last target told holds for it alone
+        if self.target_env is not None or self._traces_log:  # what the last target told holds for it alone
             self.forget_best()
             for earned in (self.ep_info_buffer, self.ep_success_buffer):
                 if earned is not None:
@@ -133,16 +134,16 @@ class TwoWorlds(PolicySnapshots):
             if self.loop is not None:
                 self.loop.forget_target()
             if self.replay_buffer.target.size() > 0:
+                remedy = "; to go on in the same one, save, and load with target_env="
                 warnings.warn(
-                    f"D_target loses {self.replay_buffer.target.size()} transitions of the target before; to go on in "
-                    "the same one, save, and load with target_env=",
+                    f"D_target loses {self.replay_buffer.target.size()} transitions of the "
+                    + ("log, whose states are estimates" if self._offline else f"target before{remedy}"),
                     stacklevel=2,
                 )
                 self.replay_buffer.target.reset()
-            if self._resume_state is not None:  # where that target stood, and a step of it that is not stored
-                self._resume_state |= {"target": None, "last_obs": None, "unstored_step": None}
-        if self._offline and self.loop is not None:
-            self.loop.accounts = False  # of a log; the target itself has yet to show that it does
+        if (self.target_env is not None or self._offline) and self._resume_state is not None:
+            # Where that target stood, and a step of it that is not stored.
+            self._resume_state |= {"target": None, "last_obs": None, "unstored_step": None}
         self._bind_rules(venv, of_target=True)
         self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
         self._offline = self._traces_log = False
@@ -205,6 +206,7 @@ class TwoWorlds(PolicySnapshots):
         last_obs = self._last_obs
         super().set_env(env, force_reset)
         if self.env is not None:
+            check_simulator(self.env, self.dynamics)
             self._bind_rules(self.env, of_target=False)
         self._last_obs = last_obs  # SB3 forgets the observation of what it takes to be the training env
         self._source_world = None
@@ -238,6 +240,7 @@ class TwoWorlds(PolicySnapshots):
     ) -> tuple[int, BaseCallback]:
         """As SB3's, with the last observation and the action noise belonging to the target."""
         starts_episode = reset_num_timesteps or self._last_obs is None
+        disturbed = self.target_env is not None and find_ledger(self.target_env).disturbed
         noise, self.action_noise = self.action_noise, None  # SB3 would size it by the source
         try:
             total_timesteps, callback = super()._setup_learn(
@@ -252,7 +255,7 @@ class TwoWorlds(PolicySnapshots):
                 noise.reset()
         if self._offline:
             self._last_obs = np.zeros((1, *self.observation_space.shape), self.observation_space.dtype)  # never read
-        elif starts_episode:
+        elif starts_episode or disturbed:  # somebody's steps end an episode, too
             self._start_target_episode()
         return total_timesteps, callback
 
@@ -265,6 +268,7 @@ class TwoWorlds(PolicySnapshots):
             single = noise.base_noise if isinstance(noise, VectorizedActionNoise) else noise
             self.action_noise = single if n_envs == 1 else VectorizedActionNoise(single, n_envs)
         self._last_obs = np.asarray(self.target_env.reset())
+        find_ledger(self.target_env).begin()
         self._last_episode_starts = np.ones(n_envs, dtype=bool)
         normaliser = unwrap_vec_normalize(self.target_env)
         self._last_original_obs = None if normaliser is None else np.asarray(normaliser.get_original_obs())
@@ -332,6 +336,10 @@ class TwoWorlds(PolicySnapshots):
             check_finite("target", observation=np.asarray(info["terminal_observation"]))
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         assert self.target_env is not None
+        side = self.replay_buffer.target
+        for i in np.flatnonzero(dones):  # SB3's are clipped where they were normalised
+            row = (side.pos - len(dones) + i) % side.buffer_size
+            side.next_observations[row, 0] = raw_terminal(self.target_env, i, infos[i]["terminal_observation"])
         find_ledger(self.target_env).unstored = False
         if self._null_check is not None:
             self._compare_with_source(self._null_check, buffer_action, dones)

@@ -18,6 +18,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_rpto.algorithms.bookkeeping import STEP, RuleOfEnvironment, TwoWorlds
+from sb3_rpto.algorithms.machine import check_simulator
 from sb3_rpto.algorithms.worlds import find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.envs.state import restore_state, save_state
@@ -40,6 +41,8 @@ NOT_SAVED = (
 )
 
 
+#: Arguments that the saved dynamics were built by.
+FIXED = frozenset({"dynamics", "dynamics_kwargs", "declared", "close_loop", "preset", "target_data"})
 #: What a VecNormalize keeps of the last step as it was.
 RAW = ("old_obs", "old_reward")
 
@@ -103,8 +106,14 @@ class Resumable(TwoWorlds):
         :param args: as SB3's ``load``
         :param target_env: the target, or its id
         :param kwargs: as SB3's ``load``
-        :raises ValueError: for a file that another algorithm saved
+        :raises ValueError: for a file that another algorithm saved, and arguments that a saved model does not change
         """
+        fixed = sorted(FIXED & set(kwargs))
+        if fixed:
+            raise ValueError(
+                f"load() does not change {', '.join(fixed)}, which the saved dynamics have; begin anew by "
+                f"{cls.__name__}.from_source(...) of the source's SAC"
+            )
         model = super().load(path, gym.make(env) if isinstance(env, str) else env, *args, **kwargs)
         if model._resume_state is None:
             raise ValueError(
@@ -118,6 +127,7 @@ class Resumable(TwoWorlds):
         if model._resume_state.get("learner") is not None:  # set_parameters() has dropped it
             model.snapshots["learner"] = model._resume_state["learner"]
         if model.env is not None:
+            check_simulator(model.env, model.dynamics)
             model._bind_rules(model.env, of_target=False)
         if target_env is not None:
             model.set_target_env(target_env)

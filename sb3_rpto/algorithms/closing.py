@@ -23,6 +23,7 @@ from sb3_rpto.tracing.report import Traced
 from sb3_rpto.tracing.trace import SETTLED
 
 if TYPE_CHECKING:
+    from sb3_rpto.algorithms.bookkeeping import TwoWorlds
     from sb3_rpto.algorithms.looping import Looping
 
 #: Target transitions before the first trace, and new ones before another.
@@ -74,6 +75,8 @@ class LoopCloser:
         self.keeps_phi = False
         #: whether the simulator accounts for the target by the last trace, so that it may judge policies
         self.accounts = False
+        #: whether a robot's log was traced that holds no transition of the task
+        self.log_is_empty = False
         #: of the policy in the simulator as it is fitted
         self.rehearsals = Rehearsals()
 
@@ -90,7 +93,7 @@ class LoopCloser:
         buffer = model.replay_buffer
         size, capacity = buffer.target.size(), buffer.target.buffer_size
         if self._traced_at is None:
-            return size >= min(FIRST, capacity)
+            return self.first_comes_after(model) <= 0
         if buffer.target_added < self._traced_at:  # loaded without its buffer
             self._traced_at = 0
         new = min(buffer.target_added - self._traced_at, size)
@@ -101,6 +104,11 @@ class LoopCloser:
         if more and (blurred or not self.found or self.found[-1]["verdict"] not in SETTLED):
             return True
         return dynamics.error(model.transitions("target").take(slice(size - new, None))) > RISEN * self._error
+
+    def first_comes_after(self, model: TwoWorlds) -> int:
+        """How many target steps the first trace still waits for; 0 or less where it is due or was made."""
+        side = model.replay_buffer.target
+        return 0 if self._traced_at is not None else min(FIRST, side.buffer_size) - side.size()
 
     def close(self, model: Looping, dynamics: PhysicalDynamics) -> None:
         """Trace on D_target, keep what lowers the error, log it, and renew D_source where another simulator made it.
@@ -142,6 +150,7 @@ class LoopCloser:
         report = self._trace(model, dynamics, measured, None)
         added = self._take(model, dynamics, report, data, math.inf)
         warm.fill_recorded(model, measured, dynamics.effects())
+        self.log_is_empty = model.replay_buffer.target.size() == 0
         self.stale = model.replay_buffer.source.size() > 0 or not model._warm
         _say(model, report, added, f"{len(measured.episodes)} recorded episodes", before, dynamics.error(data))
 
@@ -166,7 +175,7 @@ class LoopCloser:
         if self.stale:
             model.snapshots.pop("learner", None)  # of the simulator that is dropped
             renew_source(model)
-            if not model._offline and model.updates_per_step:
+            if model.updates_policy and not model._offline and model.updates_per_step:
                 learn_in_source(model, lambda: self.rehearse(model))
                 if self.may_judge(model):
                     self.rehearsals.go_back(model)
@@ -288,7 +297,9 @@ def trace_log(model: Looping) -> None:
     :raises ValueError: it is to be traced and is not there
     """
     loop, dynamics = model.loop, model.dynamics
-    if not model._traces_log or loop is None or (loop.found and model.replay_buffer.target.size() > 0):
+    if not model._traces_log or loop is None:
+        return
+    if loop.found and (loop.log_is_empty or model.replay_buffer.target.size() > 0):
         return
     assert isinstance(dynamics, PhysicalDynamics)  # else there is nothing to trace for
     if model.measured is None:

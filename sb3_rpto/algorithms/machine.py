@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from itertools import zip_longest
 
 import gymnasium as gym
@@ -11,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
+from sb3_rpto.effects.model import differing
 from sb3_rpto.envs.observations import mujoco_model, single_env
 from sb3_rpto.tracing.columns import columns_of
 
@@ -43,6 +45,24 @@ def check_machine(source: VecEnv, target: VecEnv) -> None:
         raise ValueError(
             f"a step of target_env takes {other:g} s, one of env {mine:g} s, which no number of the model makes up "
             "for; build both with the same frame_skip times timestep"
+        )
+
+
+def check_simulator(source: VecEnv, dynamics: Dynamics | None) -> None:
+    """Warn where a new source is another simulator than the one that phi is the numbers of.
+
+    :param source: which was set, or with which a checkpoint was loaded
+    :param dynamics: which were built from an earlier one
+    """
+    physical = dynamics.physical if isinstance(dynamics, ResidualDynamics) else dynamics
+    if not isinstance(physical, PhysicalDynamics):
+        return
+    found = differing(physical.model, mujoco_model(single_env(source)))
+    if found:
+        warnings.warn(
+            f"env simulates another model than the one that phi was fitted for ({', '.join(found[:3])} differ): "
+            "source episodes and fits will not agree; give the source that the model was made with, or begin anew",
+            stacklevel=3,
         )
 
 

@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import wrappers
 from scipy.interpolate import CubicHermiteSpline
 
-from sb3_rpto.dynamics.physical import check_commands
+from sb3_rpto.dynamics.simulator import check_commands
 from sb3_rpto.effects import Effect, Simulation
 from sb3_rpto.effects.simulation import names_of
 from sb3_rpto.effects.wrapper import CorrectedEnv

@@ -10,10 +10,12 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_rpto.algorithms.update import RelativeUpdate
-from sb3_rpto.algorithms.worlds import check_finite, share_normalisation
+from sb3_rpto.algorithms.worlds import check_finite, raw_terminal, share_normalisation
 from sb3_rpto.dynamics.base import Dynamics, Prediction
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
@@ -112,8 +114,7 @@ class EpisodeSource(SourceWorld):
             if normaliser is not None:
                 rewards = normaliser.get_original_reward()
             for i in np.flatnonzero(dones):
-                terminal = infos[i]["terminal_observation"]
-                raw_next[i] = terminal if normaliser is None else normaliser.unnormalize_obs(terminal)
+                raw_next[i] = raw_terminal(self.env, i, infos[i]["terminal_observation"])
             check_finite("source", observation=raw_next, reward=rewards)
             timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
             scaled = model.policy.scale_action(actions)
@@ -168,7 +169,9 @@ class SimulatorSource(EpisodeSource):
         dynamics.attach(env)
         self.dynamics = dynamics
         self.copies = [StandingEnv(copied(env), dynamics.effects()) for _ in range(num_envs)]
-        makers: list[Callable[[], gym.Env]] = [lambda copy=copy: copy for copy in self.copies]  # type: ignore[misc]
+        # What episodes earn is told by a Monitor, which SB3 puts around single environments, not around a VecEnv's.
+        told = [copy if is_wrapped(copy, Monitor) else Monitor(copy) for copy in self.copies]
+        makers: list[Callable[[], gym.Env]] = [lambda copy=copy: copy for copy in told]  # type: ignore[misc]
         stacked = DummyVecEnv(makers)
         # Copies of one environment would draw the same numbers.
         stacked.seed(self._draw())

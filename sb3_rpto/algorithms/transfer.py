@@ -25,11 +25,11 @@ from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_wo
 from sb3_rpto.algorithms.worlds import check_environment, check_spaces, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.dynamics.base import Dynamics
-from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics
+from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics, preset_section
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.weights import WeightingName
 from sb3_rpto.envs.rules import env_id
-from sb3_rpto.presets import preset_section, resolve_preset
+from sb3_rpto.presets import resolve_preset
 from sb3_rpto.tracing import Measurements
 
 Self = TypeVar("Self", bound="TransferAlgorithm")
@@ -368,10 +368,10 @@ class TransferAlgorithm(Looping):
     def _finish_open_round(self, forget: bool) -> None:
         """Make up for the steps 5 and 6 before which the last run was stopped or saved; step 3 is not done twice.
 
-        :param forget: a new run begins, and owes nothing
+        :param forget: a new run begins
         """
         if forget:
-            self._round_open, self._owed = False, 0
+            self._round_open = False
         if self._round_open and not self._offline:
             taken = self.num_timesteps - self._rollout_began_at
             if not taken:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 
@@ -33,6 +34,8 @@ CARRIED = (
     *("learning_rate", "batch_size", "tau", "gamma", "ent_coef", "target_entropy", "target_update_interval"),
     *("use_sde", "sde_sample_freq", "use_sde_at_warmup"),
 )
+#: Options of an optimizer that do not decide what it keeps of each parameter.
+FREE_OPTIONS = ("params", "lr", "weight_decay", "betas", "eps", "foreach", "fused", "capturable", "differentiable")
 
 
 def carried_arguments(sac: SAC) -> dict[str, Any]:
@@ -61,7 +64,7 @@ def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
 
 
 def carry_over(sac: SAC, model: Resumable, temperature: bool = True) -> None:
-    """Take over actor, critics, their targets, the temperature and the state of every optimiser.
+    """Take over actor, critics, their targets, the temperature and the state of every optimiser of the same kind.
 
     :param temperature: whether to take over the temperature, too
     :raises ValueError: when the source model's spaces or networks are not the model's
@@ -81,7 +84,7 @@ def carry_over(sac: SAC, model: Resumable, temperature: bool = True) -> None:
     except RuntimeError as error:
         raise ValueError(f"source_model's networks do not fit policy_kwargs={model.policy_kwargs}: {error}") from error
     for theirs, ours in ((sac.actor.optimizer, model.actor.optimizer), (sac.critic.optimizer, model.critic.optimizer)):
-        ours.load_state_dict(copy.deepcopy(theirs.state_dict()))
+        _carry_optimizer(theirs, ours)
     if temperature:
         _carry_temperature(sac, model)
     model._warm = True
@@ -238,7 +241,20 @@ def _carry_temperature(sac: SAC, model: Resumable) -> None:
         assert model.ent_coef_optimizer is not None
         assert sac.ent_coef_optimizer is not None
         model.log_ent_coef.data.copy_(sac.log_ent_coef.data)
-        model.ent_coef_optimizer.load_state_dict(copy.deepcopy(sac.ent_coef_optimizer.state_dict()))
+        _carry_optimizer(sac.ent_coef_optimizer, model.ent_coef_optimizer)
+
+
+def _carry_optimizer(theirs: th.optim.Optimizer, ours: th.optim.Optimizer) -> None:
+    """Take over what an optimizer has learned of its parameters, where ours is one that goes on with it.
+
+    Its options stay those of our ``policy_kwargs``.
+    """
+    options = [
+        [{n: v for n, v in group.items() if n not in FREE_OPTIONS} for group in o.param_groups] for o in (theirs, ours)
+    ]
+    if type(theirs) is type(ours) and options[0] == options[1]:
+        state = copy.deepcopy(theirs.state_dict())
+        ours.load_state_dict({**state, "param_groups": ours.state_dict()["param_groups"]})
 
 
 def _checked(arrays: dict[str, np.ndarray], model: Resumable, name: str) -> dict[str, np.ndarray]:

@@ -32,6 +32,8 @@ class TargetLedger(VecEnvWrapper):
         self.spent: Counter[str] = Counter(spent or {})
         #: whether a step was taken whose transition is not stored yet
         self.unstored = False
+        #: whether somebody else moved the target since :meth:`begin`
+        self.disturbed = False
         self._purpose = "other"
         self._allowance: int | None = None
 
@@ -47,8 +49,13 @@ class TargetLedger(VecEnvWrapper):
         finally:
             self._purpose, self._allowance = "other", None
 
+    def begin(self) -> None:
+        """The episode that was just begun is the algorithm's."""
+        self.disturbed = False
+
     def step_async(self, actions: np.ndarray) -> None:
         """Count, then step."""
+        self.disturbed |= self._allowance is None
         if self._allowance is not None:
             if self._allowance < self.num_envs:
                 raise RuntimeError(
@@ -67,7 +74,7 @@ class TargetLedger(VecEnvWrapper):
 
     def reset(self) -> Any:
         """Reset the target; a reset is not counted as a step."""
-        self.unstored = False
+        self.unstored, self.disturbed = False, True
         return self.venv.reset()
 
 
@@ -97,6 +104,27 @@ def share_normalisation(venv: VecEnv, source: VecEnv | None) -> VecEnv:
         shared.obs_rms = statistics.obs_rms
     shared.ret_rms = statistics.ret_rms
     return shared
+
+
+def raw_terminal(env: VecEnv, index: Any, terminal: np.ndarray) -> np.ndarray:
+    """The observation at the end of an episode as the environment gave it.
+
+    A VecNormalize clips what it hands on: far out states, such as falls are, cannot be had back from that. A
+    DummyVecEnv still holds them.
+
+    :param env: the worlds' VecEnv with all its wrappers, just stepped
+    :param index: of the environment whose episode ended
+    :param terminal: ``info["terminal_observation"]`` as it came out of ``env``
+    """
+    normaliser = unwrap_vec_normalize(env)
+    if normaliser is None:
+        return terminal
+    inner = env.unwrapped
+    held = inner.buf_infos[index].get("terminal_observation") if isinstance(inner, DummyVecEnv) else None
+    again = None if held is None else np.asarray(normaliser.normalize_obs(held))
+    if again is not None and again.shape == terminal.shape and np.allclose(again, terminal):
+        return np.asarray(held)
+    return normaliser.unnormalize_obs(terminal)  # type: ignore[return-value]
 
 
 def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
@@ -228,7 +256,8 @@ class NullShiftCheck:
             return False
         observations, _, copy_done, infos = self._copy.step(actions)
         answer = infos[0].get("terminal_observation", np.asarray(observations)[0])
-        if not np.allclose(answer, next_observation, rtol=1e-9, atol=1e-9) or bool(copy_done[0]) != done:
+        alike = answer.shape == next_observation.shape  # the copy is without VecEnvWrappers, such as VecFrameStack
+        if not alike or not np.allclose(answer, next_observation, rtol=1e-9, atol=1e-9) or bool(copy_done[0]) != done:
             self._copy = None
             return False
         self._left -= 1

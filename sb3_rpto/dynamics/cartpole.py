@@ -34,6 +34,11 @@ MAX_TRANSITIONS = 5000
 SINGULAR = 1e-8
 
 
+def is_cartpole(env: gym.Env | VecEnv) -> bool:
+    """Whether :func:`cartpole_constants` finds a cart-pole."""
+    return isinstance(_parameters(env), CartPoleParameters)
+
+
 def cartpole_constants(env: gym.Env | VecEnv) -> dict[str, float]:
     """The constants of a cart-pole, read through its wrappers.
 
@@ -41,13 +46,16 @@ def cartpole_constants(env: gym.Env | VecEnv) -> dict[str, float]:
     :return: every field of :class:`~sb3_rpto.envs.cartpole.CartPoleParameters`
     :raises ValueError: if there is no cart-pole below the wrappers
     """
-    try:
-        found = env.get_attr("parameters")[0] if isinstance(env, VecEnv) else env.get_wrapper_attr("parameters")
-    except AttributeError:
-        found = None
+    found = _parameters(env)
     if not isinstance(found, CartPoleParameters):
         raise ValueError(f"env has no cart-pole parameters: {env}; pass a ContinuousCartPoleEnv")
     return asdict(found)
+
+
+def _parameters(env: gym.Env | VecEnv) -> Any:
+    if isinstance(env, VecEnv):
+        return env.get_attr("parameters")[0] if env.has_attr("parameters") else None
+    return env.get_wrapper_attr("parameters") if env.has_wrapper_attr("parameters") else None
 
 
 class _Linearisation(NamedTuple):

@@ -9,10 +9,11 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics
-from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants
+from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants, is_cartpole
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
-from sb3_rpto.dynamics.physical import PhysicalDynamics, physical_config
+from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
+from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.envs.rules import task_rules
 
 BACKENDS = ("ensemble", "physical", "residual")
@@ -41,6 +42,19 @@ def dynamics_config(backend: str, env: VecEnv, kwargs: dict[str, Any], declared:
     raise ValueError(f"dynamics={backend!r} does not exist; choose one of {list(BACKENDS)}")
 
 
+def preset_section(backend: str | None, env: VecEnv | None) -> str:
+    """The part of a preset that fits the source's kind.
+
+    :param backend: of the dynamics; None where they are not trained
+    :param env: the source; None before it is known
+    """
+    if backend is None:
+        return "real"
+    # Fits of our own cart-pole's numbers cost nothing.
+    mujoco = backend == "physical" and env is not None and not is_cartpole(env)
+    return "mujoco" if mujoco else backend
+
+
 def _rules(env: VecEnv) -> dict[str, Any]:
     """What is known of the task's rewards and terminations."""
     rules = task_rules(env)
@@ -49,11 +63,8 @@ def _rules(env: VecEnv) -> dict[str, Any]:
 
 def _simulator(env: VecEnv, backend: str) -> dict[str, Any]:
     """What a physical model must know of the source."""
-    if backend == "physical":
-        try:
-            return {"constants": cartpole_constants(env)}
-        except ValueError:
-            pass
+    if backend == "physical" and is_cartpole(env):
+        return {"constants": cartpole_constants(env)}
     try:
         return physical_config(env)
     except ValueError as error:

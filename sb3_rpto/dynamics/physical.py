@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from gymnasium.wrappers import ClipAction
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
@@ -19,10 +18,9 @@ from sb3_rpto.dynamics.onestep import OneStep, Steps, as_steps
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.effect import from_json
 from sb3_rpto.effects.mjcf import PlainModel
-from sb3_rpto.effects.model import load_model
 from sb3_rpto.effects.simulation import Drive
-from sb3_rpto.effects.wrapper import CorrectedEnv, beyond_model
-from sb3_rpto.envs.observations import StateMap, env_name, layers, mujoco_model, noise_of_each, single_env, state_map
+from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.observations import StateMap, noise_of_each, single_env
 from sb3_rpto.envs.stance import StandingEnv
 from sb3_rpto.envs.state import copy_env
 
@@ -30,53 +28,6 @@ from sb3_rpto.envs.state import copy_env
 MAX_TRANSITIONS = 500
 #: A fit stops when no parameter moves by more than this share of its scale.
 STILL = 1e-6
-
-
-def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
-    """What :class:`PhysicalDynamics` must know of a gymnasium MuJoCo environment; plain data that pickles.
-
-    :param env: with all its wrappers; of a VecEnv the first
-    :raises ValueError: no MuJoCo model, states that cannot be recovered from observations, actions that are not the
-        commands of the actuators
-    """
-    single = single_env(env)
-    model, recover = mujoco_model(single), state_map(single)
-    check_commands(single, "dynamics='physical'")
-    hidden = beyond_model(single)
-    if hidden:
-        raise ValueError(
-            f"{env_name(single)} has effects that are no numbers of its model ({', '.join(hidden)}), which phi would "
-            "lack; give the environment without them, and them as dynamics_kwargs={'effects': [...]} (a closed "
-            "loop takes them for known)"
-        )
-    frame_skip = getattr(single.unwrapped, "frame_skip", None)
-    if frame_skip is None:
-        raise ValueError(f"{env_name(single)} has no frame_skip; derive it from gymnasium.envs.mujoco.MujocoEnv")
-    spec, _ = load_model(single)
-    plain = model.__copy__() if spec is None else PlainModel.of(spec, model)  # nothing tells the MJCF of some
-    return {"model": plain, "recover": recover, "frame_skip": int(frame_skip)}
-
-
-def check_commands(env: gym.Env, what: str) -> None:
-    """Require that actions are the commands of the actuators.
-
-    :param env: a MuJoCo environment with all its wrappers
-    :param what: needs it, for the message
-    :raises ValueError: actions of another shape than the model's commands, wrappers that change them
-    """
-    model = mujoco_model(env)
-    if env.action_space.shape != (model.nu,):
-        raise ValueError(
-            f"{env_name(env)}: actions have shape {env.action_space.shape}, the model {model.nu} actuators; "
-            f"{what} needs actions that are the commands of the actuators"
-        )
-    for layer in layers(env)[:-1]:
-        # Clipping is what the actuators do themselves.
-        if isinstance(layer, gym.ActionWrapper) and not isinstance(layer, ClipAction):
-            raise ValueError(
-                f"{env_name(env)}: the wrapper {type(layer).__name__} changes actions, and {what} needs those that "
-                "are the commands of the actuators; give it an environment without"
-            )
 
 
 class PhysicalDynamics(Dynamics):

@@ -107,6 +107,13 @@ def numbers(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     return {name: value for name, value in found.items() if not name.endswith("pathadr")}
 
 
+def differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
+    """Names of the numbers in which two compiled models differ, those that follow from others left out."""
+    derived = set(mujoco.MjModel._setconst_outputs) - set(mujoco.MjModel._setconst_inputs)
+    mine, theirs = numbers(one), numbers(other)
+    return [n for n in mine if n not in derived and not np.array_equal(mine[n], theirs[n], equal_nan=True)]
+
+
 def _public(owner: Any) -> Iterator[tuple[str, Any]]:
     return ((name, getattr(owner, name)) for name in dir(owner) if not name.startswith("_"))
 

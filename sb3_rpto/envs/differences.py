@@ -131,17 +131,12 @@ def _numbers(one: Any, other: Any) -> dict[str, tuple[str, ...]]:
         return {name: () for name in mine if mine[name] != theirs[name]}
     if not hasattr(one, "model"):
         return {}
-    import mujoco
+    from sb3_rpto.effects.model import differing, numbers
 
-    from sb3_rpto.effects.model import numbers
-
-    kept = set(mujoco.MjModel._setconst_inputs)
-    derived = set(mujoco.MjModel._setconst_outputs) - kept
     mine, theirs = numbers(one.model), numbers(other.model)
     return {
         name: _objects(one.model, name, np.asarray(mine[name] != theirs[name]))
-        for name in mine
-        if name not in derived and not _equal(mine[name], theirs[name])
+        for name in differing(one.model, other.model)
     }
 
 

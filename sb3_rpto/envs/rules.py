@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import re
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -61,6 +62,23 @@ def task_rules(env: gym.Env | VecEnv) -> TaskRules:
     if own_termination is not None:
         termination = partial(or_not_finite, own_termination)
     return TaskRules(view.own_rule("reward_fn") or reward, termination)
+
+
+def misfit(rule: Rule, observation_space: gym.Space, action_space: gym.Space) -> str | None:
+    """What a function answers two transitions by, where that is not what a rule does; None for a rule.
+
+    :param rule: to be asked
+    :param observation_space: of both worlds, flat
+    :param action_space: likewise
+    """
+    seen, actions = (th.zeros(2, *space.shape) for space in (observation_space, action_space) if space.shape)
+    try:
+        answer = rule(seen, actions, seen)
+    except Exception as error:  # whatever a function of other arguments raises
+        return f"{type(error).__name__}: {error}"
+    if not isinstance(answer, th.Tensor):
+        return type(answer).__name__
+    return None if answer.shape == (2,) else f"a tensor of shape {tuple(answer.shape)}"
 
 
 def env_id(env: VecEnv) -> str | None:
@@ -119,7 +137,16 @@ class _View:
             return None
         env = self.env or self._twin()
         rule = env.get_wrapper_attr(name) if env is not None and env.has_wrapper_attr(name) else None
-        return rule if callable(rule) else None
+        if env is None or not callable(rule):
+            return None
+        found = misfit(rule, env.observation_space, env.action_space)
+        if found is not None:
+            warnings.warn(
+                f"{name} of {env} is not taken for the task's rule: it answers two observations, actions and next "
+                f"observations by {found}, not by a tensor of shape (2,)",
+                stacklevel=2,
+            )
+        return rule if found is None else None
 
     def _is_wrapped(self, wrapper: type[gym.Wrapper]) -> bool:
         if self.env is not None:

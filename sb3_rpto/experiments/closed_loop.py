@@ -17,7 +17,8 @@ import pandas as pd
 import torch as th
 from gymnasium import spaces
 
-from sb3_rpto.dynamics.physical import PhysicalDynamics, physical_config
+from sb3_rpto.dynamics.physical import PhysicalDynamics
+from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.effects import LIBRARY, Declared, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments import sources

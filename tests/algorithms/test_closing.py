@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import warnings
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +11,7 @@ from functools import cache
 from itertools import chain, repeat
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -18,8 +20,8 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
-from sb3_rpto import RPTO
-from sb3_rpto.algorithms import closing
+from sb3_rpto import RPTO, RTO
+from sb3_rpto.algorithms import arguments, closing
 from sb3_rpto.algorithms.closing import LoopCloser, outdated, stays_finite
 from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.source import EpisodeSource
@@ -43,14 +45,14 @@ def friction() -> list[Effect]:
     return [LIBRARY["coulomb_friction"]("slider", level=LEVEL)]
 
 
-def model(lacks: list[Effect], **kwargs: object) -> RPTO:
+def model(lacks: list[Effect], cls: type = RPTO, **kwargs: object) -> RPTO:
     settings: dict[str, object] = {
         **{"dynamics": "physical", "declared": ["pole.length"], "close_loop": KINDS, "seed": 0, "device": "cpu"},
         **{"source_steps": 4, "gradient_steps": 1, "weighting": None, "model_train_freq": 40, "batch_size": 32},
         **{"target_env": None if "target_data" in kwargs else target(lacks)},
         **kwargs,
     }
-    return RPTO("MlpPolicy", gym.make(TASK), **settings)  # type: ignore[arg-type]
+    return cls("MlpPolicy", gym.make(TASK), **settings)
 
 
 @pytest.fixture
@@ -290,7 +292,7 @@ def test_a_learned_model_predicts_the_target() -> None:
     assert dynamics(made).error(made.transitions("target")) < 1e-3
 
 
-def filled(lacks: list[Effect], count: int = 100, **kwargs: object) -> RPTO:
+def filled(lacks: list[Effect], count: int = 100, **kwargs: Any) -> RPTO:
     """A model whose D_target holds random actions in the target, ready to close the loop."""
     made = model(lacks, **kwargs)
     made.learn(1, source_timesteps=0)
@@ -972,3 +974,60 @@ def test_a_policy_is_rehearsed_where_a_log_was_traced_and_no_step_of_the_budget_
     assert made.loop.found[-1]["verdict"] == "complete"
     assert made.loop.rehearsals.steps > 0
     assert made.num_timesteps == 60
+
+
+def test_a_policy_that_stays_is_not_sent_to_learn_in_the_corrected_simulator(
+    soon: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = filled(friction(), cls=RTO)
+    monkeypatch.setattr(closing, "learn_in_source", lambda *_: pytest.fail("RTO does not move the policy"))
+    assert made.loop is not None
+    made.loop.close(made, dynamics(made))
+    assert "coulomb_friction(slider).level" in dynamics(made).names
+
+
+def test_a_budget_that_ends_before_the_first_trace_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = model([])
+    with pytest.warns(UserWarning, match=r"ends before the closed loop's first trace, for which it waits 200 target"):
+        made.learn(50, source_timesteps=0)
+    with pytest.warns(UserWarning, match="waits 150 target steps"):
+        made.learn(50, reset_num_timesteps=False)
+    monkeypatch.setattr(closing, "FIRST", 120)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert made.loop is not None
+        assert made.loop.first_comes_after(made) == 20
+        arguments.check_ready(made, 20, None)
+
+
+def test_what_is_owed_is_owed_to_a_run_that_counts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = judged(monkeypatch)
+    made.learn(20, reset_num_timesteps=False, callback=lambda *_: made._owed < 10)
+    updates = made._n_updates
+    made.learn(30)
+    assert (made._n_updates - updates, made._owed) == (40, 0)
+
+
+def test_a_target_after_its_log_begins_anew(soon: None) -> None:
+    measured = Measurements.from_replay(filled(friction()).replay_buffer, gym.make(TASK))
+    made = model([], target_data=measured).learn(40, source_timesteps=0)
+    assert made.loop is not None
+    assert made.loop.accounts
+    made.take_snapshot("learner")
+    with pytest.warns(UserWarning, match=r"D_target loses \d+ transitions of the log, whose states are estimates"):
+        made.set_target_env(target(friction()))
+    assert (made.replay_buffer.target.size(), made.loop.accounts) == (0, False)
+    assert "learner" not in made.snapshots
+    made.learn(130)
+    assert [found["verdict"] for found in made.loop.found] == ["explained", "explained"]
+    assert dynamics(made).describe()["coulomb_friction(slider).level"] == pytest.approx(LEVEL, rel=0.01)
+
+
+def test_a_checkpoint_of_a_log_goes_on_in_a_target_without_a_word_of_its_state(soon: None, tmp_path: Path) -> None:
+    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
+    model([], target_data=measured).learn(40, source_timesteps=0).save(tmp_path / "model")
+    made = RPTO.load(tmp_path / "model", env=gym.make(TASK), target_env=target([]), device="cpu")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*cannot restore its state")
+        made.learn(45, reset_num_timesteps=False)
+    assert made.target_spent == {"learning": 45}

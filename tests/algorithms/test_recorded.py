@@ -296,6 +296,16 @@ def test_a_model_saved_before_its_trace_asks_for_the_log(tmp_path: Path) -> None
         loaded.learn(20, source_timesteps=0)
 
 
+def test_a_log_that_corrects_the_simulator_alone_is_not_asked_for_again(tmp_path: Path) -> None:
+    measured = log(pushed=True)
+    fallen = [replace(episode, qpos=episode.qpos + np.array([0, 0.6])) for episode in measured.episodes]
+    with pytest.warns(UserWarning, match="learns there alone"):
+        made = model(replace(measured, episodes=fallen), close_loop=["torque_offset"]).learn(20, source_timesteps=20)
+    made.save(tmp_path / "model")
+    loaded = RPTO.load(tmp_path / "model", env=gym.make(TASK), device="cpu")
+    assert loaded.learn(20, reset_num_timesteps=False).num_timesteps == 40
+
+
 def test_with_the_loop_open_the_declared_numbers_alone_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
     fits: list[int] = []
     monkeypatch.setattr(PhysicalDynamics, "fit", lambda *_, **__: fits.append(1))

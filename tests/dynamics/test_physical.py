@@ -13,7 +13,8 @@ from gymnasium import spaces, wrappers
 from shifted import HOPPER, POLE, POLES, SHIFTS, collect, joined, noisy, shifted
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_rpto.dynamics.physical import MAX_TRANSITIONS, PhysicalDynamics, physical_config
+from sb3_rpto.dynamics.physical import MAX_TRANSITIONS, PhysicalDynamics
+from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.effects import Declared
 from sb3_rpto.effects.commands import CommandDelay, CommandGain
 from sb3_rpto.effects.friction import StribeckFriction

@@ -7,8 +7,8 @@ import pytest
 import torch as th
 
 from sb3_rpto.dynamics.base import Transitions, relative_error
-from sb3_rpto.dynamics.physical import physical_config
 from sb3_rpto.dynamics.residual import ResidualDynamics
+from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.effects import Effect, from_json
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.envs.rules import task_rules

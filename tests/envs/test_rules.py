@@ -227,6 +227,20 @@ def test_wrappers_that_change_data_take_the_rules_with_them():
     assert task_rules(VecFrameStack(make_vec_env("Pendulum-v1"), 2)) == TaskRules(None, None)
 
 
+def test_a_function_of_that_name_that_is_no_rule_is_told_and_left():
+    class Other(OwnRules):
+        def reward_fn(self, state, action):
+            return 0.0
+
+        def termination_fn(self, observations, actions, following):
+            return False
+
+    with pytest.warns(UserWarning, match="not taken for the task's rule") as told:
+        assert task_rules(Other()) == TaskRules(None, None)
+    assert ["by bool" in str(w.message) for w in told] == [True, False]
+    assert "TypeError" in str(told[1].message)
+
+
 def test_an_unknown_environment_has_no_rules():
     assert task_rules(gym.make("CartPole-v1")) == TaskRules(None, None)
     gym.register("elsewhere/Hopper-v0", entry_point=Half, kwargs={"env": OwnRules()})

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_checker import check_env as check_for_sb3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_rpto.dynamics.physical import physical_config
+from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.effects.carry import load_corrected, save_corrected
 from sb3_rpto.effects.model import load_model, numbers
 from sb3_rpto.envs import tasks

@@ -1,0 +1,125 @@
+"""Whether a gymnasium MuJoCo environment is what a physical model fits, and what that must know of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium.wrappers import ClipAction
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_rpto.effects.mjcf import PlainModel
+from sb3_rpto.effects.model import differing, load_model
+from sb3_rpto.effects.simulation import quiet
+from sb3_rpto.effects.wrapper import beyond_model
+from sb3_rpto.envs.observations import env_name, layers, mujoco_model, single_env, state_map
+from sb3_rpto.envs.state import copy_env
+
+#: Episodes whose first step is compared with MuJoCo alone.
+TRIED = 3
+
+
+def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
+    """What :class:`~sb3_rpto.dynamics.physical.PhysicalDynamics` must know of an environment; plain data that pickles.
+
+    :param env: with all its wrappers; of a VecEnv the first
+    :raises ValueError: no MuJoCo model, states that cannot be recovered from observations, actions that are not the
+        commands of the actuators, steps that are more than their simulation, several models
+    """
+    single = single_env(env)
+    model, recover = mujoco_model(single), state_map(single)
+    check_commands(single, "dynamics='physical'")
+    check_alike(env)
+    hidden = beyond_model(single)
+    if hidden:
+        raise ValueError(
+            f"{env_name(single)} has effects that are no numbers of its model ({', '.join(hidden)}), which phi would "
+            "lack; give the environment without them, and them as dynamics_kwargs={'effects': [...]} (a closed "
+            "loop takes them for known)"
+        )
+    frame_skip = getattr(single.unwrapped, "frame_skip", None)
+    if frame_skip is None:
+        raise ValueError(f"{env_name(single)} has no frame_skip; derive it from gymnasium.envs.mujoco.MujocoEnv")
+    check_step(single, int(frame_skip))
+    spec, _ = load_model(single)
+    plain = model.__copy__() if spec is None else PlainModel.of(spec, model)  # nothing tells the MJCF of some
+    return {"model": plain, "recover": recover, "frame_skip": int(frame_skip)}
+
+
+def check_commands(env: gym.Env, what: str) -> None:
+    """Require that actions are the commands of the actuators.
+
+    :param env: a MuJoCo environment with all its wrappers
+    :param what: needs it, for the message
+    :raises ValueError: actions of another shape than the model's commands, wrappers that change them
+    """
+    model = mujoco_model(env)
+    if env.action_space.shape != (model.nu,):
+        raise ValueError(
+            f"{env_name(env)}: actions have shape {env.action_space.shape}, the model {model.nu} actuators; "
+            f"{what} needs actions that are the commands of the actuators"
+        )
+    for layer in layers(env)[:-1]:
+        # Clipping is what the actuators do themselves.
+        if isinstance(layer, gym.ActionWrapper) and not isinstance(layer, ClipAction):
+            raise ValueError(
+                f"{env_name(env)}: the wrapper {type(layer).__name__} changes actions, and {what} needs those that "
+                "are the commands of the actuators; give it an environment without"
+            )
+
+
+def check_alike(env: gym.Env | VecEnv) -> None:
+    """Require that all environments of a VecEnv simulate one model: phi is the numbers of one.
+
+    :raises ValueError: models that differ
+    """
+    members = env.unwrapped.envs if isinstance(env, VecEnv) and isinstance(env.unwrapped, DummyVecEnv) else []
+    models = [mujoco_model(member) for member in members]
+    for other in models[1:]:
+        found = differing(models[0], other)
+        if found:
+            raise ValueError(
+                f"its environments simulate different models ({', '.join(found[:3])}), and phi is the numbers of "
+                "one; give one environment, and dynamics_kwargs={'randomise': 1.0} for episodes that differ"
+            )
+
+
+def check_step(env: gym.Env, frame_skip: int) -> None:
+    """Require that a step of the environment is the simulation of its action, and nothing else.
+
+    A task that scales actions in ``step()``, say, would have its scaling counted as error of the model. A copy is
+    stepped by random actions and compared with MuJoCo alone. What cannot be copied is refused later.
+
+    :param env: a MuJoCo environment with all its wrappers; untouched
+    :param frame_skip: simulation steps in one step of it
+    :raises ValueError: other commands or another motion
+    """
+    twin = copy_env(env)
+    if twin is None:
+        return
+    base: Any = twin.unwrapped
+    twin.action_space.seed(0)
+    limited = base.model.actuator_ctrllimited.astype(bool)[:, None]
+    low, high = np.where(limited, base.model.actuator_ctrlrange, (-np.inf, np.inf)).T
+    for seed in range(TRIED):
+        twin.reset(seed=seed)
+        action = twin.action_space.sample()
+        commands = np.clip(action, low, high)
+        alone = mujoco.MjData(base.model)
+        mujoco.mj_copyData(alone, base.model, base.data)
+        alone.ctrl[:] = commands
+        with quiet():
+            mujoco.mj_step(base.model, alone, nstep=frame_skip)
+            twin.step(action)
+        if not np.allclose(np.clip(base.data.ctrl, low, high), commands):
+            found = f"gives the commands {base.data.ctrl} where the action is {action}"
+        elif not (np.allclose(base.data.qpos, alone.qpos) and np.allclose(base.data.qvel, alone.qvel)):
+            found = "moves otherwise than MuJoCo under the same command"
+        else:
+            continue
+        raise ValueError(
+            f"{env_name(env)}: step() {found}, and phi would make up for what step() adds; let actions be the "
+            "commands of the actuators, and forces part of the MJCF or an effect (dynamics_kwargs={'effects': [...]})"
+        )

@@ -1,0 +1,190 @@
+"""The two worlds: what their buffers hold, who moved the target, which sources a simulator can stand for."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import SMALL_POLICY, pendulum, small
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
+from stable_baselines3 import SAC
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+
+from sb3_rpto import RPO, RPTO
+from sb3_rpto.dynamics.factory import preset_section
+from sb3_rpto.dynamics.simulator import physical_config
+from sb3_rpto.effects import declare
+from sb3_rpto.envs.corrected import apply_effects
+
+POLE = "InvertedPendulum-v5"
+#: Falls beyond this many rad end an episode.
+FALLEN = 0.2
+
+
+def heavier(factor: float = 1.2) -> gym.Env:
+    env = gym.make(POLE)
+    (mass,) = declare(env.unwrapped.model, ["pole.mass"])  # type: ignore[attr-defined]
+    return apply_effects(env, [mass.with_values(factor * mass.values)])
+
+
+def simulated(source: Any, **kwargs: Any) -> RPTO:
+    settings = {"dynamics": "physical", "declared": ["pole.mass"], "seed": 0, "device": "cpu", "source_steps": 4}
+    settings |= {"gradient_steps": 1, "batch_size": 32, "model_train_freq": 40, "policy_kwargs": SMALL_POLICY}
+    return RPTO("MlpPolicy", source, **{"target_env": heavier(), **settings, **kwargs})
+
+
+# ---------------------------------------------------------------------- terminal observations
+
+
+def narrow(venv: Any) -> VecNormalize:
+    """Normalised as by a policy that balances: a fall is twenty standard deviations away, and is clipped at ten."""
+    normalised = VecNormalize(venv, norm_reward=False)
+    normalised.obs_rms.var, normalised.obs_rms.count = np.array([1e-2, 1e-4, 1e-1, 1e-1]), 1e6  # type: ignore[union-attr]
+    return normalised
+
+
+@pytest.mark.parametrize("dynamics", ["real", "physical"])
+def test_buffers_hold_falls_as_they_were_where_normalisation_clips_them(dynamics: str) -> None:
+    source = narrow(DummyVecEnv([lambda: gym.make(POLE)]))
+    if dynamics == "real":
+        made = small(RPO, source, heavier()).learn(100, source_timesteps=100)
+    else:
+        made = simulated(source).learn(100, source_timesteps=100)
+    for side in (made.replay_buffer.source, made.replay_buffer.target):
+        ended = side.dones[: side.size(), 0].astype(bool)
+        assert ended.any()
+        assert (np.abs(side.next_observations[: side.size(), 0, 1][ended]) > FALLEN).all()
+
+
+def test_where_the_environments_are_elsewhere_falls_are_what_normalisation_left() -> None:
+    source = narrow(SubprocVecEnv([lambda: gym.make(POLE)], start_method="fork"))
+    made = small(RPO, source, heavier()).learn(20, source_timesteps=100)
+    side = made.replay_buffer.source
+    ended = side.dones[: side.size(), 0].astype(bool)
+    np.testing.assert_allclose(np.abs(side.next_observations[: side.size(), 0, 1][ended]), 0.1, rtol=0.02)
+    source.close()
+
+
+# ---------------------------------------------------------------------- the target under somebody else's hands
+
+
+def test_steps_of_somebody_else_between_two_runs_end_the_episode() -> None:
+    made = simulated(gym.make(POLE)).learn(30, source_timesteps=100)
+    evaluate_policy(made, made.target_env, n_eval_episodes=2, warn=False)
+    made.learn(30, reset_num_timesteps=False)
+    data = made.transitions("target")
+    assert made.dynamics is not None
+    made.dynamics.fit(data)
+    assert made.dynamics.error(data) < 1e-6  # a transition from one episode into another would show
+
+
+def test_without_them_the_episode_goes_on() -> None:
+    made = small(RPO).learn(30, source_timesteps=0)
+    made.learn(30, reset_num_timesteps=False)
+    side = made.replay_buffer.target
+    np.testing.assert_array_equal(side.next_observations[29, 0], side.observations[30, 0])
+
+
+# ---------------------------------------------------------------------- sources that a simulator cannot stand for
+
+
+class Scaled(InvertedPendulumEnv):
+    def step(self, action: np.ndarray) -> Any:
+        return super().step(0.3 * np.asarray(action))
+
+
+class Pushed(InvertedPendulumEnv):
+    def step(self, action: np.ndarray) -> Any:
+        self.data.xfrc_applied[2, 0] = 3.0
+        return super().step(action)
+
+
+@pytest.mark.parametrize(("made_by", "message"), [(Scaled, "gives the commands"), (Pushed, "moves otherwise")])
+def test_a_step_that_is_more_than_its_simulation_is_refused(made_by: type[gym.Env], message: str) -> None:
+    with pytest.raises(ValueError, match=rf"step\(\) {message}.*phi would make up for"):
+        simulated(gym.wrappers.TimeLimit(made_by(), 1_000))
+
+
+def test_the_simulators_own_tasks_pass() -> None:
+    names = "Ant HalfCheetah Hopper Humanoid HumanoidStandup InvertedDoublePendulum Pusher Reacher Swimmer Walker2d"
+    for name in names.split():
+        physical_config(gym.make(f"{name}-v5"))
+
+
+def test_sources_with_different_models_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"simulate different models \(.*body_mass.*'randomise'"):
+        simulated(DummyVecEnv([lambda: gym.make(POLE), lambda: heavier(2.0)]))
+    simulated(DummyVecEnv([lambda: gym.make(POLE), lambda: gym.make(POLE)]))
+
+
+def test_another_simulator_in_the_place_of_the_source_is_told(tmp_path: Any) -> None:
+    made = simulated(gym.make(POLE))
+    made.save(tmp_path / "model.zip")
+    with pytest.warns(UserWarning, match="another model than the one that phi was fitted for"):
+        made.set_env(heavier(2.0))
+    with pytest.warns(UserWarning, match="another model"):
+        RPTO.load(tmp_path / "model.zip", heavier(2.0), device="cpu")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        RPTO.load(tmp_path / "model.zip", gym.make(POLE), device="cpu").set_env(gym.make(POLE))
+
+
+def test_episodes_of_the_simulator_are_counted_without_a_monitor() -> None:
+    made = simulated(VecNormalize(DummyVecEnv([lambda: gym.make(POLE)])))
+    made.learn(10, source_timesteps=50)
+    assert made._source_world is not None
+    assert made._source_world.log()["ep_rew_mean"] > 0
+
+
+def test_the_cart_poles_preset_is_for_cart_poles() -> None:
+    class Own(InvertedPendulumEnv):
+        parameters = {"note": 1}  # noqa: RUF012
+
+    assert preset_section("physical", DummyVecEnv([Own])) == "mujoco"
+    assert preset_section("physical", DummyVecEnv([lambda: gym.make("rpto/ContinuousCartPole-v0")])) == "physical"
+
+
+def test_a_source_whose_vec_env_changes_observations_is_not_compared() -> None:
+    source = VecFrameStack(DummyVecEnv([pendulum]), 2)
+    target = VecFrameStack(DummyVecEnv([lambda: pendulum(12.0)]), 2)
+    assert small(RPO, source, target).learn(30, source_timesteps=50).num_timesteps == 30
+
+
+# ---------------------------------------------------------------------- what is carried over, and what is not
+
+
+def sac(**kwargs: Any) -> SAC:
+    return SAC("MlpPolicy", pendulum(), learning_starts=10, seed=0, device="cpu", policy_kwargs=kwargs).learn(30)
+
+
+def warm(source: SAC, **kwargs: Any) -> RPO:
+    return RPO.from_source(source, pendulum(), pendulum(12.0), device="cpu", **kwargs)
+
+
+def test_the_optimizers_options_are_those_that_were_passed() -> None:
+    source = sac(net_arch=[16])
+    options = {"net_arch": [16], "optimizer_kwargs": {"weight_decay": 1e-2, "betas": (0.5, 0.9)}}
+    made = warm(source, policy_kwargs=options)
+    (group,) = made.actor.optimizer.param_groups
+    assert (group["weight_decay"], group["betas"]) == (1e-2, (0.5, 0.9))
+    assert len(made.actor.optimizer.state) == len(source.actor.optimizer.state) > 0
+    made.learn(10)
+
+
+@pytest.mark.parametrize("optimizer", [th.optim.SGD, th.optim.RMSprop, th.optim.AdamW])
+def test_another_optimizer_begins_anew(optimizer: type[th.optim.Optimizer]) -> None:
+    made = warm(sac(net_arch=[16]), policy_kwargs={"net_arch": [16], "optimizer_class": optimizer})
+    assert len(made.actor.optimizer.state) == 0
+    made.learn(10)
+
+
+@pytest.mark.parametrize("name", ["close_loop", "declared", "dynamics_kwargs", "preset"])
+def test_loading_refuses_what_it_cannot_change(name: str, tmp_path: Any) -> None:
+    simulated(gym.make(POLE)).save(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match=rf"load\(\) does not change {name}"):
+        RPTO.load(tmp_path / "model.zip", **{name: True})
