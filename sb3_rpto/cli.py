@@ -131,6 +131,12 @@ def _add_trace(commands: Commands) -> None:
         default=0,
         help="set the threshold from N data sets simulated from the fitted model (slow; default: as shipped)",
     )
+    parser.add_argument(
+        "--simulated",
+        action="store_true",
+        help="the recordings are of MODEL's own simulator, in its steps in time (default: found out; being told saves "
+        "a second search)",
+    )
     parser.add_argument("--format", choices=sorted(FORMATS), help="of the recordings (default: by their suffix)")
     parser.add_argument("--quiet", action="store_true", help="no progress; print the verdict alone")
     parser.set_defaults(run=_trace)
@@ -141,7 +147,7 @@ def _names(text: str) -> list[str]:
 
 
 def _trace(parsed: argparse.Namespace) -> int:
-    from sb3_rpto.effects.carry import read_effects
+    from sb3_rpto.effects.carry import overwrites, read_effects, save_corrected
     from sb3_rpto.effects.model import load_model
     from sb3_rpto.tracing import figures, trace
 
@@ -152,6 +158,10 @@ def _trace(parsed: argparse.Namespace) -> int:
     if parsed.calibrate < 0:
         raise ValueError(f"--calibrate is {parsed.calibrate}; give a number of data sets, or 0 for none")
     model = _model(parsed.model)
+    if overwrites(parsed.out, model):
+        raise ValueError(f"--out {parsed.out} holds MODEL, and its model.xml would be overwritten; give another folder")
+    with tempfile.TemporaryDirectory() as trial:
+        save_corrected(trial, model, [])
     data = _recordings(parsed.files, parsed.format)
     known = [] if parsed.known is None else read_effects(parsed.known, load_model(model)[1])
     parsed.out.mkdir(parents=True, exist_ok=True)
@@ -167,13 +177,23 @@ def _trace(parsed: argparse.Namespace) -> int:
             candidates=parsed.candidates,
             horizon=parsed.horizon,
             calibrate=parsed.calibrate,
+            simulated=parsed.simulated,
             progress=progress,
         )
-    print(report.verdict if parsed.quiet else report)  # before it is written: what fails there must not lose it
-    report.save(parsed.out)
+    # Printed and written, whichever of the two fails.
+    try:
+        _say(report.verdict if parsed.quiet else str(report))
+    finally:
+        report.save(parsed.out)
     if not parsed.quiet:
-        print(f"\nwritten: {parsed.out / 'report.html'}")
+        _say(f"\nwritten: {parsed.out / 'report.html'}")
     return 0
+
+
+def _say(text: str) -> None:
+    """Print, with question marks for what the terminal's encoding lacks: units and file names are not all ASCII."""
+    encoding = sys.stdout.encoding or "utf-8"
+    print(text.encode(encoding, errors="replace").decode(encoding), flush=True)
 
 
 def _model(name: str) -> Any:

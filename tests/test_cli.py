@@ -1,6 +1,7 @@
 """The command sb3-rpto: exit codes, messages, and what it writes."""
 
 import csv
+import io
 import json
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 from sb3_rpto import __version__, cli
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.experiments.planting import generate
-from sb3_rpto.tracing import wording
+from sb3_rpto.tracing import Measurements, Report, trace, wording
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +120,61 @@ def test_an_output_that_cannot_be_a_folder_fails_before_the_work(
 ) -> None:
     assert run(files, "--out", str(files / "runs.csv")) == 2
     assert "runs.csv" in error(capsys)
+
+
+def test_the_nominal_model_is_not_overwritten(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (files / "robot.xml").read_text()
+    (tmp_path / "model.xml").write_text(text)
+    assert cli.main(["trace", str(tmp_path / "model.xml"), str(files / "runs.csv"), "--out", str(tmp_path)]) == 2
+    assert "--out" in (said := error(capsys))
+    assert "give another folder" in said
+    assert (tmp_path / "model.xml").read_text() == text
+
+
+@pytest.fixture(scope="module")
+def found(files: Path) -> Report:
+    """What a trace finds."""
+    data = Measurements.from_csv(str(files / "runs.csv"))
+    return trace(str(files / "robot.xml"), data, candidates=["coulomb_friction"], threads=1)
+
+
+def refuse(*_: object) -> None:
+    raise FileNotFoundError("tip.obj is gone")
+
+
+def test_a_model_that_cannot_be_saved_fails_before_the_work(
+    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sb3_rpto.effects.carry.write_mjcf", refuse)
+    monkeypatch.setattr("sb3_rpto.tracing.trace", lambda *_, **__: pytest.fail("it was started"))
+    assert run(files) == 2
+    assert "tip.obj is gone" in error(capsys)
+
+
+def test_the_report_is_written_where_the_model_cannot_be(
+    files: Path, found: Report, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sb3_rpto.tracing.trace", lambda *_, **__: found)
+    monkeypatch.setattr("sb3_rpto.tracing.report.save_corrected", refuse)
+    assert run(files, "--out", str(tmp_path / "new")) == 2
+    captured = capsys.readouterr()
+    assert captured.out.startswith("verdict: ")
+    assert captured.err.endswith("sb3-rpto: error: tip.obj is gone\n")
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["report.html", "report.json"]
+
+
+def test_what_a_terminal_cannot_show_keeps_nothing_from_being_written(
+    files: Path, found: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sb3_rpto.tracing.trace", lambda *_, **__: found)
+    stdout = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", stdout)
+    assert run(files, "--out", str(tmp_path / "plain")) == 0
+    assert b"N?m" in stdout.buffer.getvalue()
+    monkeypatch.setattr(cli, "_say", refuse)
+    assert run(files, "--out", str(tmp_path / "closed")) == 2
+    for name in ("plain", "closed"):
+        assert {"report.json", "model.xml"} <= {path.name for path in (tmp_path / name).iterdir()}
 
 
 def test_without_matplotlib_nothing_is_started(

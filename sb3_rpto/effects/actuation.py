@@ -67,13 +67,37 @@ def motor_torque(world: World, actuator: int, dof: int, adr: int) -> np.ndarray:
 
 
 def joint_torque(world: World, actuators: list[int] | None, dof: int, adr: int) -> np.ndarray:
-    """Sum of the actuators' generalised forces at a joint, (n,); that of the substep before where they have memory.
+    """Sum of the actuators' generalised forces at a joint, (n,), within what its ``actuatorfrcrange`` lets through.
 
-    :param actuators: from :func:`motors`
+    :param actuators: from :func:`motors`; None: the sum of the substep before
     """
     if actuators is None:
         return world.actuation[:, dof]
+    return _through(world, _sum(world, actuators, dof, adr), dof)
+
+
+def joint_loss(world: World, actuators: list[int], dof: int, adr: int, loss: np.ndarray) -> np.ndarray:
+    """What a joint loses, (n,), where its actuators' sum is less by ``loss``: nothing of what its limit takes anyway.
+
+    :param actuators: all that act on the joint
+    """
+    if not world.model.jnt_actfrclimited[world.model.dof_jntid[dof]]:
+        return loss
+    total = _sum(world, actuators, dof, adr)
+    return _through(world, total, dof) - _through(world, total - loss, dof)
+
+
+def _sum(world: World, actuators: list[int], dof: int, adr: int) -> np.ndarray:
     return sum((motor_torque(world, a, dof, adr) for a in actuators), np.zeros(world.n))
+
+
+def _through(world: World, torque: np.ndarray, dof: int) -> np.ndarray:
+    """What reaches a joint of its actuators' sum: MuJoCo clips it to the joint's ``actuatorfrcrange``."""
+    joint = world.model.dof_jntid[dof]
+    if not world.model.jnt_actfrclimited[joint]:
+        return torque
+    limits = world.field("jnt_actfrcrange")[:, joint]
+    return np.clip(torque, limits[:, 0], limits[:, 1])
 
 
 def _affine(parameters: np.ndarray, length: np.ndarray, speed: np.ndarray) -> np.ndarray:

@@ -84,9 +84,12 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
         :func:`load_corrected` refuses
     :param source: the nominal model, see :func:`~sb3_rpto.effects.model.load_model`; not an MjModel alone
     :param effects: with their values
-    :raises ValueError: nothing tells the MJCF of ``source``, or it has effects that are no numbers of its model
+    :raises ValueError: nothing tells the MJCF of ``source``, or it has effects that are no numbers of its model, or it
+        is the ``model.xml`` that would be overwritten
     :raises FileNotFoundError: an asset is missing
     """
+    if overwrites(folder, source):
+        raise ValueError(f"{Path(folder) / 'model.xml'} is the nominal model and would be overwritten; save elsewhere")
     spec, nominal = load_model(source)
     if spec is None:
         raise ValueError(
@@ -108,6 +111,14 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
         _write(folder / name, content)
     _write(folder / "model.xml", text.encode())
     _write(folder / "effects.json", json.dumps(stored, indent=1).encode())
+
+
+def overwrites(folder: str | os.PathLike[str], source: ModelSource) -> bool:
+    """Whether a simulator saved to ``folder`` would replace the file of its nominal model."""
+    if not isinstance(source, str | os.PathLike) or str(source).lstrip().startswith("<"):
+        return False
+    file, saved = Path(source).expanduser(), Path(folder) / "model.xml"
+    return file.is_file() and saved.is_file() and saved.samefile(file)
 
 
 def load_corrected(folder: str | os.PathLike[str]) -> Corrected:
@@ -140,7 +151,7 @@ def load_corrected(folder: str | os.PathLike[str]) -> Corrected:
         )
     model = mujoco.MjModel.from_xml_path(str(xml))
     restore(model, stored["exact"])
-    return Corrected(model, [_rebuild(entry, model) for entry in stored["effects"]])
+    return Corrected(model, [_rebuild(entry, model, entry.get("nominal")) for entry in stored["effects"]])
 
 
 def read_effects(path: str | os.PathLike[str], model: mujoco.MjModel) -> list[Effect]:
@@ -170,10 +181,11 @@ def _describe(effect: Effect, model: mujoco.MjModel) -> dict[str, Any]:
     return entry
 
 
-def _rebuild(entry: Mapping[str, Any], model: mujoco.MjModel) -> Effect:
+def _rebuild(entry: Mapping[str, Any], model: mujoco.MjModel, nominal: Mapping[str, float] | None = None) -> Effect:
+    """The effect of an entry; ``nominal`` where ``model`` is no longer the one that it changes."""
     if entry["kind"] == Declared.kind:
         ((name, value),) = entry["values"].items()
-        return Declared(model, name, (-np.inf, np.inf)).with_values(np.array([value]))
+        return Declared(model, name, (-np.inf, np.inf), (nominal or {}).get(name)).with_values(np.array([value]))
     if entry["kind"] not in LIBRARY:
         raise ValueError(
             f"no effect {entry['kind']!r} is registered ({near(entry['kind'], LIBRARY)}); import the module with "

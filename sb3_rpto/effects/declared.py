@@ -103,7 +103,8 @@ def _read_kv(model: mujoco.MjModel, actuator: int) -> float:
 
 
 def _write_kv(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
-    if _servo(world.model, actuator) == "velocity":
+    # Of the two servos that have it, that of the velocity: :func:`_servo` cannot tell once the gain has changed.
+    if world.model.actuator_gainprm[actuator, 0] and not world.model.actuator_biasprm[actuator, 1]:
         world.field("actuator_gainprm")[:, actuator, 0] = values
     world.field("actuator_biasprm")[:, actuator, 2] = -values
 
@@ -212,6 +213,7 @@ class Declared(Effect):
     :param name: ``<object>.<parameter>``, with ``joint:`` (``body:``, ``geom:``, ``actuator:``) before the object
         where two objects share a name, and ``option`` as the object of ``gravity``, ``viscosity`` and ``density``
     :param bounds: smallest and largest value; default: from 0, or a tenth to ten times the nominal value
+    :param nominal: its nominal value where ``model`` has been corrected since; default: that of ``model``
     :raises ValueError: no such object or parameter, an actuator that is not the servo which has it, a nominal value of
         zero where only factors make sense, bounds that do not hold the nominal value
     """
@@ -221,12 +223,18 @@ class Declared(Effect):
     equation = "a number of the model"
     known = True
 
-    def __init__(self, model: mujoco.MjModel, name: str, bounds: tuple[float, float] | None = None) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        name: str,
+        bounds: tuple[float, float] | None = None,
+        nominal: float | None = None,
+    ) -> None:
         #: kind of object it belongs to, or ``option``
         self.owner, self.index, self._how = _find(model, name)
         how = self._how
         try:
-            nominal = how.read(model, self.index)
+            nominal = how.read(model, self.index) if nominal is None else nominal
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         if how.span is not None and nominal == 0:

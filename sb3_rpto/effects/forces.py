@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.actuation import memoryless, motor_torque
+from sb3_rpto.effects.actuation import joint_loss, memoryless, motor_torque, motors
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.names import SCALAR_JOINTS, hinges, object_names
 from sb3_rpto.effects.world import World
@@ -129,6 +129,8 @@ class DCMotor(Effect):
             )
         joint = model.actuator_trnid[self.index, 0]
         self.dof, self.adr = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
+        # Where those beside it have memory, what they do is not known now: the joint's limit is then of this one alone.
+        self.beside = motors(model, int(joint)) or [self.index]
 
     def act(self, world: World, x: np.ndarray) -> None:
         """Take away what the motor cannot give."""
@@ -137,4 +139,5 @@ class DCMotor(Effect):
         driving = np.where(torque * speed > 0, np.abs(speed), 0.0)
         room = np.maximum(1 - x[:, 1] * driving, 0.0)
         limit = np.divide(room, x[:, 0], out=np.where(room > 0, np.inf, 0.0), where=x[:, 0] > 0)
-        world.force[:, self.dof] -= torque - np.clip(torque, -limit, limit)
+        loss = torque - np.clip(torque, -limit, limit)
+        world.force[:, self.dof] -= joint_loss(world, self.beside, self.dof, self.adr, loss)

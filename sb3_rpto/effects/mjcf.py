@@ -51,16 +51,24 @@ def write_mjcf(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[str, dict[st
     :param model: with other numbers
     :return: the text and the content of ``assets/<name>``
     :raises FileNotFoundError: a mesh, texture or height field is missing
+    :raises ValueError: such a file is not the one that MuJoCo reads
     """
     spec = spec.copy()
-    _tell_inertia(spec, spec.compile())
+    compiled = spec.compile()
+    _tell_inertia(spec, compiled)
     try:
         spec.compile()
         spec.copy_back(model)
     except ValueError:
         _copy_some(spec, model)
-    assets = _gather(spec)
-    spec.compile()
+    assets = _gather(spec, compiled)
+    moved = spec.compile()
+    for name in ("mesh_vert", "hfield_data", "skin_vert", "tex_data"):
+        if not np.array_equal(getattr(moved, name), getattr(compiled, name)):
+            raise ValueError(
+                f"{name} changes when the model's files are copied, so some are not those that MuJoCo reads; give "
+                "different names to the files of models that are attached"
+            )
     return spec.to_xml(), assets
 
 
@@ -115,35 +123,47 @@ def _copy_some(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
             continue  # effects.json holds it
 
 
-def _gather(spec: mujoco.MjSpec) -> dict[str, bytes]:
+def _gather(spec: mujoco.MjSpec, compiled: mujoco.MjModel) -> dict[str, bytes]:
     """Point every element that has a file to ``assets/`` and read these files."""
     found: dict[str, bytes] = {}
     known = dict(spec.assets)
 
-    def move(folder: str, file: str) -> str:
-        content = _read(spec.modelfiledir, folder, file, known)
-        name = f"{PurePath(file).stem}-{hashlib.sha256(content).hexdigest()[:8]}{PurePath(file).suffix}"
+    def move(path: str) -> str:
+        content = _read(spec.modelfiledir, path, known)
+        name = f"{PurePath(path).stem}-{hashlib.sha256(content).hexdigest()[:8]}{PurePath(path).suffix}"
         found[f"assets/{name}"] = content
         return name
 
-    folders = [(spec.meshes, spec.meshdir), (spec.hfields, spec.meshdir), (spec.skins, spec.meshdir)]
-    for elements, folder in [*folders, (spec.textures, spec.texturedir)]:
+    kinds = {"mesh": spec.meshes, "hfield": spec.hfields, "skin": spec.skins, "tex": spec.textures}
+    for kind, elements in kinds.items():
         for element in elements:
             if element.file:
-                element.file = move(folder, element.file)
+                element.file = move(_path(compiled, getattr(compiled, f"{kind}_pathadr")[element.id]))
     for texture in spec.textures:
-        texture.cubefiles = [move(spec.texturedir, file) if file else "" for file in texture.cubefiles]
+        texture.cubefiles = [move(_cube_path(spec, texture, file)) if file else "" for file in texture.cubefiles]
     if found:
         spec.meshdir = spec.texturedir = "assets"
         spec.assets = found
     return found
 
 
-def _read(base: str, folder: str, file: str, known: dict[str, bytes]) -> bytes:
-    for name in (os.path.join(folder, file), file):
-        if name in known:
-            return known[name]
-    path = Path(base) / folder / file
-    if not path.is_file():
-        raise FileNotFoundError(f"the model's asset {file!r} is not at {str(path)!r}")
-    return path.read_bytes()
+def _path(compiled: mujoco.MjModel, address: int) -> str:
+    """Where MuJoCo found a file, by its own rules: no MjSpec tells the folder of a model that is attached."""
+    return compiled.paths[address : compiled.paths.index(b"\0", address)].decode()
+
+
+def _cube_path(spec: mujoco.MjSpec, texture: mujoco.MjsTexture, file: str) -> str:
+    """The same of one side of a cube, which a compiled model does not tell."""
+    name = PurePath(file).name if spec.strippath else file
+    return os.path.join(spec.modelfiledir, texture.compiler.texturedir, name)
+
+
+def _read(base: str, path: str, known: dict[str, bytes]) -> bytes:
+    by_name = {PurePath(key).name: content for key, content in known.items()}
+    # As MuJoCo does: of what is in memory, the name alone may do.
+    for name, files in ((path, known), (os.path.relpath(path, base or "."), known), (PurePath(path).name, by_name)):
+        if name in files:
+            return files[name]
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"the model's asset {PurePath(path).name!r} is not at {path!r}")
+    return Path(path).read_bytes()

@@ -100,14 +100,20 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         if self._covered:
             raise ValueError("other effects came on top of these; set those, or begin from an environment without")
         base: Any = self.unwrapped
-        sensing = [effect.label for effect, _ in active(own(effects, base.model)) if effect.senses]
-        if sensing and not callable(getattr(base, "_get_obs", None)):
-            raise ValueError(f"{', '.join(sensing)}: {type(base).__name__} has no _get_obs(); read its sensors there")
         self._world.restore()
         self._world.settle()
-        # Only now: the values that declared parameters start from are the model's own again.
-        self.effects = own(effects, base.model)
-        found = active(self.effects)
+        try:
+            # Only now: what declared parameters start from is the model's own again.
+            mine = own(effects, base.model)
+            sensing = [effect.label for effect, _ in active(mine) if effect.senses]
+            if sensing and not callable(getattr(base, "_get_obs", None)):
+                raise ValueError(
+                    f"{', '.join(sensing)}: {type(base).__name__} has no _get_obs(); read its sensors there"
+                )
+        except Exception:
+            prepare(self._world, active(self.effects))
+            raise
+        self.effects, found = mine, active(mine)
         prepare(self._world, found)
         memories = {effect.label: memory for (effect, _), memory in zip(self._commanding, self._memory)}
         self._acting = [pair for pair in found if pair[0].overrides("act")]

@@ -135,6 +135,20 @@ def quantum(velocity: np.ndarray) -> float | None:
     return float(steps[steps > 1e-9 * np.ptp(levels)].min())
 
 
+def rounding(position: np.ndarray) -> float | None:
+    """Step that a position is rounded to, 0 where it is not; None of one that never changes, which tells nothing.
+
+    :param position: shape (T,)
+    """
+    levels = np.unique(position)
+    if len(levels) < 2:
+        return None
+    if 2 * len(levels) >= len(position):
+        return 0.0
+    steps = np.diff(levels)
+    return float(steps[steps > 1e-9 * np.ptp(levels)].min())  # levels that differ by float's rounding are one
+
+
 def velocity_slope(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> float | None:
     """Slope of a measured velocity against the position's change: of all that the noise leaves open, the nearest to 1.
 

@@ -13,7 +13,7 @@ from scipy.signal import savgol_filter
 
 from sb3_rpto.effects import Declared
 from sb3_rpto.effects.actuation import FILTERS
-from sb3_rpto.effects.names import object_names
+from sb3_rpto.effects.names import hinges, object_names
 from sb3_rpto.tracing.checks import WINDOW, Finding, smoothed_velocity
 from sb3_rpto.tracing.columns import columns_of, joint_of
 from sb3_rpto.tracing.measurements import Measurements
@@ -22,8 +22,8 @@ from sb3_rpto.tracing.windows import command_order, discretised, stiff
 ALL = "all episodes"
 SLOW = 0.02
 """A machine sampled at longer steps than this, in s, is said to be sampled slowly."""
-LONGEST_STEP, MOST_SUBSTEPS = 0.5, 500
-"""Samples farther apart than this in s, and than so many steps of the model, are taken for times in another unit."""
+LONGEST_STEP = 0.5
+"""Samples farther apart than this, in s, are taken for times in another unit."""
 SHORTEST_STEP = 0.01
 """Samples nearer to each other than this share of the model's step are taken for times in another unit."""
 TURNS = 6
@@ -137,10 +137,10 @@ def _check_clock(model: mujoco.MjModel, data: Measurements) -> None:
     """Refuse samples so far apart that their times can hardly be in seconds."""
     steps = [np.diff(e.time) for e in data.episodes if len(e) > 1]
     step = float(np.median(np.concatenate(steps))) if steps else 0.0
-    if not data.exact and step > max(LONGEST_STEP, MOST_SUBSTEPS * model.opt.timestep):
+    if not data.exact and step > LONGEST_STEP:
         raise ValueError(
             f"the median step of column 'time' is {step:g} s, the model's {model.opt.timestep:g} s; give times in "
-            "seconds, or sample the machine faster"
+            "seconds (are these milliseconds?), or sample the machine faster"
         )
     if not data.exact and 0 < step < SHORTEST_STEP * model.opt.timestep:
         raise ValueError(
@@ -204,11 +204,10 @@ def _clipped(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
 
 def doubts(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     """What may be wrong with recordings that nothing explains: angles in degrees, commands that never change."""
-    found, hinge = [], mujoco.mjtJoint.mjJNT_HINGE
+    found, joints = [], hinges(model)
     for i, name in enumerate(data.columns.qpos):
-        joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
         turns = float(np.median([np.ptp(e.qpos[:, i]) for e in data.episodes])) / (2 * np.pi)
-        if joint >= 0 and model.jnt_type[joint] == hinge and turns > TURNS:
+        if name in joints and turns > TURNS:
             message = (
                 f"it spans {turns:.0f} turns in a typical run; if it is in degrees, give rad (also where the MJCF has "
                 'angle="degree")'

@@ -20,8 +20,9 @@ from sb3_rpto.tracing.windows import cut, discretised, noise_levels
 WINDOWS, ITERATIONS = 16, 10
 #: Typical window error, in units of the noise, that leaves nothing to ask.
 ENOUGH = 1.1
-#: They come from the model's own steps where those err by less than this share of what fine ones do.
-CLEARLY = 0.5
+#: They come from the model's own steps where those err by less than this share of what fine ones do, or, where they
+#: leave nothing to ask, by less than the second.
+CLEARLY, SOMEWHAT = 0.5, 0.8
 #: They may be exact where their noise is less than this share of what exact ones count as noisy by.
 NOISELESS = 0.03
 
@@ -40,7 +41,8 @@ def origin(
     """Whether recordings seem to be a machine's, or the model's own with noise, or without any.
 
     They are the model's own where its fit to the declared parameters meets them clearly better in its own steps in time
-    than in fine ones: a simulator's long semi-implicit steps err by more than many a sensor does. They are exact where
+    than in fine ones, or meets them there and not so in fine ones: a simulator's long semi-implicit steps err by more
+    than many a sensor does. They are exact where
     they hardly have noise and their states lead to one another as exact ones do.
 
     :param model: as it was compiled
@@ -65,7 +67,10 @@ def origin(
         return float(np.median(fit.errors))
 
     continuous = error(data, sigma)
-    if continuous < ENOUGH or error(replace(data, simulated=True), sigma) > CLEARLY * continuous:
+    if continuous < ENOUGH:
+        return "machine"
+    own = error(replace(data, simulated=True), sigma)
+    if own > (SOMEWHAT if own < ENOUGH else CLEARLY) * continuous:
         return "machine"
     exact = replace(data, exact=True, noise=None)
     level = noise_levels(exact)

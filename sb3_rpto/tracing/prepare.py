@@ -109,18 +109,28 @@ def prepare(
     horizon: float | None,
     threads: int,
     known: Sequence[Effect] = (),
+    simulated: bool = False,
 ) -> SetUp:
     """Check the data against the model, part them, measure their noise, and set up the simulations.
 
     Parameters and errors as :func:`sb3_rpto.tracing.trace.trace`.
     """
     spec, compiled = load_model(model)
+    data = replace(data, simulated=data.simulated or simulated)
     data, turned = settle_turns(compiled, data)
     findings = [*data.findings, *turned, *check_against(compiled, data)]
     given(compiled, declared, known)  # what is wrong there is said before the work
     train, select, test = data.split(seed)
     findings += [f for f in train.findings if f not in findings]
     fitted = replace(data, episodes=train.episodes + select.episodes)
+    resting = at_rest(fitted)
+    if resting:
+        unobserved = (*data.unobserved, *resting)
+        data, train, select, test, fitted = (
+            replace(d, unobserved=unobserved) for d in (data, train, select, test, fitted)
+        )
+        message = "never changes, so nothing tells how finely it is measured: it is not compared with predictions"
+        findings += [Finding("at rest", f"fitted runs, qpos.{name}", message) for name in resting]
     sigma = noise_levels(fitted)
     changes = contact_changes(compiled, fitted)
     touching = changes > OFTEN
@@ -157,6 +167,18 @@ def prepare(
     rough = Simulation(discretised(compiled, fitted, fine=False), effects, threads)
     longer = _longer(rough.model, train, select, sigma, length) if horizon is None else None
     return SetUp(spec, compiled, findings, train, select, test, fitted, sigma, fine, rough, scales, length, longer)
+
+
+def at_rest(data: Measurements) -> list[str]:
+    """Measured positions that never change, by their columns' names; none where all rest, or states are known whole.
+
+    :param data: to fit to
+    """
+    moves = np.ptp(np.concatenate([e.qpos for e in data.episodes]), axis=0) > 0
+    seen = [name not in data.unobserved for name in data.columns.qpos]
+    if data.whole_states or not moves[seen].any():
+        return []
+    return [name for name, one, moved in zip(data.columns.qpos, seen, moves) if one and not moved]
 
 
 def _candidates(model: mujoco.MjModel, there: Sequence[Effect], kinds: Sequence[str] | None) -> list[Effect]:
@@ -215,11 +237,13 @@ def windows(
             return cut(model, train, sigma, horizon, many * TRAIN, overlap), judging
     train = replace(train, episodes=train.episodes + select.episodes)
     every = cut(model, train, sigma, horizon, many * (TRAIN + SELECT), overlap)
-    if len(every) < FEW:
+    few = len(every) < FEW
+    if few:
         every = cut(model, train, sigma, horizon, 2 * FEW, overlap=OVERLAP)
-        if len(np.unique(every.block)) < 3:
-            raise ValueError(
-                f"the training runs hold {len(every)} window(s) of {horizon:g} s in fewer than three blocks of a "
-                "second: too few to select on; record longer, or lower horizon"
-            )
+    # Some hundred transitions of a simulator are soon over, and tell much.
+    if (few or not train.whole_states) and len(np.unique(every.block)) < 3:
+        raise ValueError(
+            f"the training runs hold {len(every)} window(s) of {horizon:g} s in fewer than three blocks of a "
+            "second: too few to select on; record longer, or lower horizon"
+        )
     return every, None

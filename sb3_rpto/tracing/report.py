@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import mujoco
 import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
@@ -304,16 +305,22 @@ class Report:
         :param folder: made if absent; files in it are replaced one by one, each whole
         :return: the folder
         :raises ImportError: matplotlib is not installed; nothing is written then
-        :raises ValueError: the model came as an ``MjModel``, whose MJCF nothing tells; nothing is written then
+        :raises ValueError: the model came as an ``MjModel``, whose MJCF nothing tells; nothing is written then. Where
+            the model cannot be written for another reason, the report is
         """
         from sb3_rpto.tracing.html import render
 
         out = Path(folder)
-        # Rendered before anything is written: what fails leaves the folder as it was.
+        # Rendered before anything is written: what fails there leaves the folder as it was.
         page, data = render(self), json.dumps(self.to_json(), indent=1, allow_nan=False, ensure_ascii=False)
-        save_corrected(out, self.source, self.correction)
-        write_atomically(out / "report.json", data + "\n")
-        write_atomically(out / "report.html", page)
+        try:
+            save_corrected(out, self.source, self.correction)
+        finally:
+            # After a long trace, a file that is missing must not lose what was found.
+            if not isinstance(self.source, mujoco.MjModel):
+                out.mkdir(parents=True, exist_ok=True)
+                write_atomically(out / "report.json", data + "\n")
+                write_atomically(out / "report.html", page)
         return out
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Loss, Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.model_checks import doubts
+from sb3_rpto.tracing.origin import origin
 from sb3_rpto.tracing.prepare import Progress, SetUp, prepare
 from sb3_rpto.tracing.report import Candidate, Report, Traced
 from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary
@@ -53,6 +55,7 @@ def trace(
     horizon: float | None = None,
     calibrate: int = 0,
     threads: int = 0,
+    simulated: bool = False,
     progress: Progress | None = None,
 ) -> Report:
     """Find out which effect a model lacks to explain measured data.
@@ -74,6 +77,8 @@ def trace(
         for short episodes, and twice that to go on with where what was found leaves errors far above the noise
     :param calibrate: recalibrate the threshold of selection on so many sets simulated from the fitted declared model
     :param threads: that simulate; 0: one for each core
+    :param simulated: whether the recordings are of the model's own simulator, in its own steps in time; False: that is
+        found out where it matters, at the latest when something is left unexplained, which takes a second search
     :param progress: called with the share done and what is being done
     :return: the verdict, the effects, errors before and after, and the corrected model
     :raises ValueError: data and model do not fit together, the data are too few, or an argument is out of range
@@ -81,16 +86,18 @@ def trace(
     """
     _check_arguments(data, seed, candidates, horizon, calibrate, threads)
     say = _steady(progress)
-    set_up = prepare(model, data, declared, seed, candidates, horizon, threads, known)
+
+    def searched(simulated: bool) -> tuple[SetUp, Found]:
+        made = prepare(model, data, declared, seed, candidates, horizon, threads, known, simulated)
+        at, finer = partial(made.selectors, say=say), partial(made.finer, say=say)
+        return made, find(at, finer, made.length, made.longer, seed, calibrate)
+
+    set_up, found = searched(simulated)
+    again = _of_own_steps(set_up, found, declared, threads)
+    if again is not None:
+        set_up, found = searched(True)
+        set_up.findings.append(again)
     sigma, fitted = set_up.sigma, set_up.fitted
-    found = find(
-        lambda length: set_up.selectors(length, say),
-        lambda length: set_up.finer(length, say),
-        set_up.length,
-        set_up.longer,
-        seed,
-        calibrate,
-    )
     selector, selection = found.on.fine, found.selection
     simulation, findings = selector.simulation, set_up.findings
     step, usual = (1e3 * float(s.model.opt.timestep) for s in (simulation, set_up.fine))
@@ -122,7 +129,7 @@ def trace(
     verdict = judge(found.before, found.after, bool(selection.model.effects))
     if verdict not in SETTLED:
         findings += doubts(set_up.nominal, fitted) + _early(found, fitted)
-    findings += _undetermined(problem, final, intervals)
+    findings += _undetermined(problem, final, intervals) + _at_bounds(problem, final)
     findings += _strays(selector, final, set_up, seed)
     unstable = problem.unstable(final)
     if unstable:
@@ -161,6 +168,39 @@ def trace(
         data=data,
         sigma=sigma,
     )
+
+
+def _of_own_steps(set_up: SetUp, found: Found, declared: Sequence[str], threads: int) -> Finding | None:
+    """Whether recordings that were taken for a machine's turn out to be the model's own, now that something is found.
+
+    What is missing errs as much in one kind of steps as in another; with it in the model they can be told apart.
+    """
+    named = bool(found.selection.model.effects)
+    if judge(found.before, found.after, named) in SETTLED or not named:
+        return None
+    simulation, values = found.on.fine.simulation, found.selection.model.fit.values
+    known = [i for i, e in enumerate(simulation.effects) if e.known and not isinstance(e, Declared)]
+    kept = (*known, *found.selection.model.effects)
+    there = [simulation.effects[i].with_values(values[simulation.slices[i]]) for i in kept]
+    kind = origin(set_up.nominal, set_up.fitted, declared, set_up.sigma, set_up.length, threads, there)
+    if kind == "machine":
+        return None
+    message = "from the model's own steps in time, as shows with what was found first; searched again in such steps"
+    return Finding("simulated", "fitted runs", message)
+
+
+def _at_bounds(problem: Problem, values: np.ndarray) -> list[Finding]:
+    """What was given and ends at a bound that it did not begin at; nothing is below 0 of what cannot be negative."""
+    found = []
+    owners = [(e, p) for e in problem.simulation.effects for p in e.parameters]
+    there = (values <= problem.lower) | (values >= problem.upper)
+    for i in np.flatnonzero(problem.known & there & (values != 0) & (values != problem.null)):
+        effect, parameter = owners[i]
+        is_number = isinstance(effect, Declared)
+        where = f"declared {effect.label}" if is_number else f"known {effect.label}, {parameter.name}"
+        message = f"{values[i]:.4g} is its bound; where the machine may lie beyond, give wider ones"
+        found.append(Finding("at its bound", where, message + (f" ({effect.label}=low:high)" if is_number else "")))
+    return found
 
 
 def _steady(progress: Progress | None) -> Progress:
@@ -202,9 +242,10 @@ def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 20
             moves.append(-np.linalg.solve(linear.normal[rows].sum(0) + ridge, gradient) * problem.size[free])
         r = problem.residuals(np.tile(fit.values, (len(joined), 1)), fit.starts, np.arange(len(joined)))
         r = r[np.repeat(joined.usable, joined.measured.shape[2], axis=1)]
-        wider = widening(len(blocks)) / Loss.of(r).curvature(r)
-        intervals[:, free] = fit.values[free] + wider * np.quantile(moves, [0.025, 0.975], axis=0)
-        intervals = np.clip(intervals, problem.lower, problem.upper)
+        if len(blocks) > 1:  # a single one does not scatter
+            wider = widening(len(blocks)) / Loss.of(r).curvature(r)
+            intervals[:, free] = fit.values[free] + wider * np.quantile(moves, [0.025, 0.975], axis=0)
+            intervals = np.clip(intervals, problem.lower, problem.upper)
         intervals[:, hidden] = np.nan
     return values, intervals
 

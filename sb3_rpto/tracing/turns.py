@@ -7,6 +7,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.names import object_names
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.measurements import Measurements
 
@@ -26,13 +27,14 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
     :return: the recordings, and what was found
     """
     wrapped = {finding.where for finding in data.findings if finding.kind == "wrapped angle"}
+    joints = object_names(model, "joint")
     found, episodes = [], []
     for episode in data.episodes:
         qpos = episode.qpos.copy()
         for column, name in enumerate(data.columns.qpos):
-            joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
-            if joint < 0:  # a coordinate of a ball or free joint, or a name that is refused later
+            if name not in joints:  # a coordinate of a ball or free joint, or a name that is refused later
                 continue
+            joint = joints.index(name)
             where, limited = f"{episode.name}, qpos.{name}", bool(model.jnt_limited[joint])
             low, high = model.jnt_range[joint] if limited else (-np.inf, np.inf)
             middle = float(np.median(qpos[:, column]))

@@ -98,9 +98,9 @@ def noise_levels(data: Measurements) -> np.ndarray:
             continue
         at = [_difference_noise(data.episodes, i, order) for order in range(3, 8)]
         order = next((k for k in range(4) if at[k + 1] > 0.93 * at[k]), 4)
-        steps = [checks.quantum(e.qpos[:, i]) or 0.0 for e in data.episodes]
+        steps = [step for e in data.episodes if (step := checks.rounding(e.qpos[:, i])) is not None]
         # A smooth signal without noise still has the rounding of its file.
-        levels.append(max(at[order], float(np.median(steps)) / math.sqrt(12), 1e-7))
+        levels.append(max(at[order], float(np.median(steps or [0.0])) / math.sqrt(12), 1e-7))
     return np.array(levels)
 
 

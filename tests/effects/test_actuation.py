@@ -19,8 +19,10 @@ ACTUATORS = {
 
 
 @pytest.mark.parametrize("kind", ACTUATORS)
-def test_torque_is_mujocos(kind: str) -> None:
-    model = mujoco.MjModel.from_xml_string(XML.format(ACTUATORS[kind]))
+@pytest.mark.parametrize("limit", ["", 'actuatorfrcrange="-1.5 2"'])
+def test_torque_is_mujocos(kind: str, limit: str) -> None:
+    xml = XML.format(ACTUATORS[kind]).replace('name="a"', f'name="a" {limit}')
+    model = mujoco.MjModel.from_xml_string(xml)
     on = motors(model, 0)
     assert on is not None
     rng = np.random.default_rng(0)

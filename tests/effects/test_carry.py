@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales, Simulation, declare, register
+from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales, Simulation, declare, mjcf, register
 from sb3_rpto.effects.carry import carried_by, correct, load_corrected, save_corrected
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
 from sb3_rpto.effects.model import load_model, numbers
@@ -153,6 +153,18 @@ def test_every_declared_parameter_reloads(tmp_path):
     assert_equal_rollouts(loaded.simulation(1), Simulation(nominal, chosen, 1))
 
 
+@pytest.mark.parametrize("names", [["servo.kp", "servo.kv"], ["servo.gain", "servo.kv"]])
+def test_a_servo_that_is_none_once_corrected_reloads(tmp_path, names):
+    nominal = load_model(PLAIN)[1]
+    chosen = [d.with_values(1.2 * d.values) for d in declare(nominal, names)]
+    chosen += [LIBRARY["command_gain"]("servo", change=0.1)] if "servo.kp" in names else []
+    save_corrected(tmp_path, PLAIN, chosen)
+    loaded = load_corrected(tmp_path)
+    assert [repr(e) for e in loaded.effects] == [repr(e) for e in chosen]
+    assert [d.nominal for d in loaded.effects[:2]] == [7.0, 0.5]
+    assert_equal_models(loaded.model, correct(nominal, chosen))
+
+
 def test_saving_what_was_loaded_gives_the_same_files(tmp_path):
     save_corrected(tmp_path / "one", PLAIN, effects(load_model(PLAIN)[1]))
     save_corrected(tmp_path / "two", PLAIN, load_corrected(tmp_path / "one").effects)
@@ -258,6 +270,53 @@ def test_meshes_travel_with_the_model(tmp_path):
     with pytest.raises((ValueError, FileNotFoundError), match=r"tip\.obj"):
         save_corrected(tmp_path / "again", tmp_path / "here" / "arm.xml", chosen)
     assert not (tmp_path / "again").exists()
+
+
+def attached(folder, main, part):
+    """The file of a model with a mesh and, attached, one from another folder, each with its own meshdir."""
+    (folder / "parts").mkdir()
+    (folder / "sub" / "meshes").mkdir(parents=True)
+    (folder / "parts" / main).write_text(TETRAHEDRON)
+    (folder / "sub" / "meshes" / part).write_text(TETRAHEDRON.replace(".1", ".2"))
+    (folder / "sub" / "part.xml").write_text(f"""<mujoco><compiler meshdir="meshes"/><asset>
+        <mesh name="m" file="{part}"/></asset><worldbody><body name="p"><joint/>
+        <geom type="mesh" mesh="m"/></body></worldbody></mujoco>""")
+    (folder / "arm.xml").write_text(f"""<mujoco><compiler meshdir="parts"/><asset><mesh name="m" file="{main}"/>
+        <model name="part" file="sub/part.xml"/></asset><worldbody><body><joint name="elbow"/>
+        <geom type="mesh" mesh="m"/><attach model="part" body="p" prefix="x_"/></body></worldbody></mujoco>""")
+    return folder / "arm.xml"
+
+
+@pytest.mark.parametrize("names", [("tip.obj", "tip.obj"), ("tip.obj", "tool.obj")])
+def test_the_mesh_of_an_attached_model_is_its_own(tmp_path, names):
+    path = attached(tmp_path, *names)
+    save_corrected(tmp_path / "out", path, [CoulombFriction("elbow", level=0.1)])
+    plain = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml"))
+    np.testing.assert_array_equal(plain.mesh_vert, load_model(path)[1].mesh_vert)
+
+
+def test_stripped_paths_are_those_of_mujoco(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "tip.obj").write_text(TETRAHEDRON)
+    text = MESHED.replace("<compiler ", '<compiler strippath="true" ').replace('"tip.obj"', '"robot/meshes/tip.obj"')
+    (tmp_path / "arm.xml").write_text(text)
+    save_corrected(tmp_path / "out", tmp_path / "arm.xml", [])
+    assert_equal_models(load_corrected(tmp_path / "out").model, load_model(tmp_path / "arm.xml")[1])
+
+
+def test_files_that_mujoco_does_not_read_are_refused(tmp_path, monkeypatch):
+    path = attached(tmp_path, "tip.obj", "tool.obj")
+    monkeypatch.setattr(mjcf, "_path", lambda compiled, address: str(tmp_path / "parts" / "tip.obj"))
+    with pytest.raises(ValueError, match="mesh_vert changes when the model's files are copied"):
+        save_corrected(tmp_path / "out", path, [])
+
+
+def test_the_nominal_model_is_not_overwritten(tmp_path):
+    (tmp_path / "model.xml").write_text(PLAIN)
+    with pytest.raises(ValueError, match="is the nominal model and would be overwritten; save elsewhere"):
+        save_corrected(tmp_path, tmp_path / "model.xml", [])
+    assert (tmp_path / "model.xml").read_text() == PLAIN
+    save_corrected(tmp_path, PLAIN, [])  # what an earlier save left is another matter
 
 
 def test_torn_folders_are_refused(tmp_path):

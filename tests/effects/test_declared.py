@@ -196,6 +196,14 @@ def test_plain_numbers_reach_the_model() -> None:
     assert model.opt.density == 1.2
 
 
+def test_a_velocity_servo_stays_one_whose_gain_is_fitted() -> None:
+    model = MODEL.__copy__()
+    for world in (BatchWorld(MODEL, 1, 1), LiveWorld(model, mujoco.MjData(model))):
+        for name, value in (("speed.gain", 4.0), ("speed.kv", 2.0)):
+            Declared(MODEL, name).write(world, np.array([[value]]))
+        assert world.field("actuator_gainprm")[0, 2, 0] == 2.0
+
+
 @given(st.floats(0.15, 9))
 def test_mass_scales_inertia_and_inertia_leaves_mass(factor: float) -> None:
     body = MODEL.body("arm").id

@@ -332,6 +332,20 @@ def test_gain_sits_where_the_force_is_linear_in_it() -> None:
     assert LIBRARY["command_gain"].places(model) == ["plain", "affine"]
 
 
+def test_a_motors_limit_is_its_forcerange_whatever_its_joint_lets_through() -> None:
+    text = """<mujoco><option timestep="0.002"/><worldbody><body><joint name="j" axis="0 1 0" actuatorfrcrange="-5 4"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="1"/></body></worldbody><actuator>
+    <position name="a" joint="j" kp="200" kv="1" %s/><motor joint="j" gear="3"/></actuator></mujoco>"""
+    limited, model = (mujoco.MjModel.from_xml_string(text % s) for s in ('forcerange="-6 6"', ""))
+    commands = 2 * np.sin(np.arange(300) / 20)[None, :, None] * np.array([1.0, -0.7])
+    found = []
+    for one, effects in ((limited, []), (model, [LIBRARY["dc_motor"]("a", inverse_stall=1 / 6)]), (model, [])):
+        sim = Simulation(one, effects, 1)
+        found.append(sim.rollout(sim.values()[None], np.zeros((1, 1)), np.zeros((1, 1)), Drive(commands))[0])
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+    assert np.abs(found[2] - found[0]).max() > 0.01
+
+
 def test_lag_is_the_mean_of_filterexact() -> None:
     """Ten steps of MuJoCo's own filter, started at the first command; T dy/dt = u - y tells its mean over each."""
     model = mujoco.MjModel.from_xml_string("""

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from pathlib import Path
 
 import gymnasium as gym
 import mujoco
@@ -291,6 +292,17 @@ def test_a_declared_value_starts_from_the_models_own_again():
     np.testing.assert_allclose(model.body_inertia[1], inertia * 3.0 / nominal, rtol=1e-12)
     wrapped.set_effects([Declared(model, "hinge.damping")])
     assert model.body_mass[1] == nominal
+
+
+def test_a_servos_gain_is_set_again_where_it_is_none_any_more(tmp_path):
+    xml = Path(gym.make(POLE).unwrapped.fullpath).read_text().replace("<motor", '<position kp="20"')
+    (tmp_path / "servo.xml").write_text(xml.replace('gear="500"', ""))
+    env = gym.make(POLE, xml_file=str(tmp_path / "servo.xml"))
+    model = env.unwrapped.model
+    kp = Declared(model, "slide.kp").with_values(np.array([25.0]))
+    wrapped = CorrectedEnv(env, [kp, LIBRARY["command_gain"]("slide", change=0.1)])
+    wrapped.set_effects([kp])
+    assert model.actuator_gainprm[0, 0] == -model.actuator_biasprm[0, 1] == 25.0
 
 
 def go_on(wrapped, reference, actions):

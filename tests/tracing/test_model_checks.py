@@ -173,6 +173,12 @@ def test_times_in_milliseconds_are_refused():
         found(model_of(), tables)
 
 
+def test_milliseconds_of_a_fast_clock_are_refused_too():
+    tables = {run: table | {"time": 1e2 * table["time"]} for run, table in measured(model_of()).items()}
+    with pytest.raises(ValueError, match=r"is 1 s.*are these milliseconds\?"):
+        found(model_of(), tables)
+
+
 def test_times_in_kiloseconds_are_refused_too():
     tables = {run: table | {"time": 1e-3 * table["time"]} for run, table in measured(model_of()).items()}
     with pytest.raises(ValueError, match=r"is 1e-05 s, the model's 0.002 s; give times in seconds"):

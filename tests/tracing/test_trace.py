@@ -256,6 +256,11 @@ def test_a_run_too_short_to_be_parted_into_blocks_is_refused() -> None:
         traced_simply(few(1, 2.0), horizon=None)
 
 
+def test_many_short_windows_of_a_single_second_are_refused_too() -> None:
+    with pytest.raises(ValueError, match="in fewer than three blocks of a second"):
+        traced_simply(recorded(episodes=1, duration=1.0), horizon=0.02)
+
+
 def test_progress_goes_forward() -> None:
     _, shares = watched()
     assert len(shares) > 5
@@ -401,6 +406,17 @@ def test_declared_numbers_of_which_the_data_tell_nothing_are_named() -> None:
     ]
     moved = briefly(PENDULUM, recorded(), ["hinge.damping", "pole.mass"], candidates=[])
     assert "undetermined" not in {f.kind for f in moved.findings}
+
+
+def test_a_declared_number_that_ends_at_its_bound_is_named() -> None:
+    light = PENDULUM.replace('mass="0.5"', 'mass="0.3"')  # where the machine has 0.5
+    narrow, wide = (
+        briefly(light, recorded(), [f"pole.mass=0.2:{most}", "hinge.damping"], candidates=[]) for most in (0.4, 1.0)
+    )
+    (finding,) = [f for f in narrow.findings if f.kind == "at its bound"]
+    assert (finding.where, finding.message[:4]) == ("declared pole.mass", "0.4 ")
+    assert "pole.mass=low:high" in finding.message
+    assert "at its bound" not in {f.kind for f in wide.findings}
 
 
 def test_data_that_were_not_read_are_refused_at_once() -> None:

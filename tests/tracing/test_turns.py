@@ -49,3 +49,13 @@ def test_what_no_turn_accounts_for_is_said_and_kept() -> None:
     degrees = np.degrees(ANGLE[:100])
     _, found = settle_turns(arm('range="-1.5 1.5"'), recorded(degrees))
     assert "outside limits" in [f.kind for f in found]
+
+
+def test_a_joint_without_a_name_has_whole_turns_too() -> None:
+    model = mujoco.MjModel.from_xml_string("""<mujoco><compiler angle="radian"/><worldbody><body>
+        <joint axis="0 1 0" range="-1.5 1.5"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".03"/>
+        </body></worldbody></mujoco>""")
+    column = {"time": np.arange(len(ANGLE)) * 0.01, "qpos.joint0": ANGLE + TURN}
+    data, found = settle_turns(model, Measurements.from_tables({"run": column}))
+    np.testing.assert_allclose(data.episodes[0].qpos[:, 0], ANGLE, atol=1e-12)
+    assert [f.kind for f in found] == ["whole turns"]

@@ -11,6 +11,7 @@ from sb3_rpto.effects import Simulation
 from sb3_rpto.effects.names import object_id
 from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.interpolation import interpolate
+from sb3_rpto.tracing.prepare import at_rest
 from sb3_rpto.tracing.windows import EXACT, cut, discretised, noise_levels
 
 SIGMA = np.array([1e-3])
@@ -67,6 +68,21 @@ def test_a_quantised_signal_without_noise_has_at_least_the_noise_of_rounding() -
     (found,) = noise_levels(swings(quantum=4e-3))
     assert 4e-3 / np.sqrt(12) <= found * 1.001
     assert found < 4e-3
+
+
+def test_runs_in_which_a_joint_rests_do_not_say_how_it_is_rounded() -> None:
+    """A stiff joint behind an encoder: at rest in four runs of five, on two levels in the last."""
+    q = [np.full(500, 0.01) for _ in range(4)] + [np.where(np.arange(500) // 100 % 2, 0.012, 0.01)]
+    assert noise_levels(measured([clock(500, 200.0, 0.0, 0)] * 5, q)) == pytest.approx([2e-3 / np.sqrt(12)])
+
+
+def test_positions_that_never_change_are_not_compared() -> None:
+    moving, still = 0.1 * np.sin(np.arange(100) / 5), np.full(100, 0.3)
+    table = {"time": np.arange(100) * 0.01, "qpos.a": moving, "qpos.b": still}
+    assert at_rest(Measurements.from_tables({"run": table})) == ["b"]
+    assert at_rest(Measurements.from_tables({"run": table, "other": table | {"qpos.b": still + 1e-3}})) == []
+    assert at_rest(Measurements.from_tables({"run": table | {"qpos.a": still}})) == []  # nothing would be left
+    assert at_rest(replace(Measurements.from_tables({"run": table}), exact=True)) == []
 
 
 def test_exact_data_have_a_fixed_small_share_of_their_spread_as_noise() -> None:
