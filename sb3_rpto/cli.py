@@ -159,7 +159,10 @@ def _trace(parsed: argparse.Namespace) -> int:
         raise ValueError(f"--calibrate is {parsed.calibrate}; give a number of data sets, or 0 for none")
     model = _model(parsed.model)
     if overwrites(parsed.out, model):
-        raise ValueError(f"--out {parsed.out} holds MODEL, and its model.xml would be overwritten; give another folder")
+        raise ValueError(
+            f"--out {parsed.out} holds a model.xml that is MODEL, or that no trace wrote, and it would be overwritten; "
+            "give another folder"
+        )
     with tempfile.TemporaryDirectory() as trial:
         save_corrected(trial, model, [])
     data = _recordings(parsed.files, parsed.format)

@@ -85,11 +85,14 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
     :param source: the nominal model, see :func:`~sb3_rpto.effects.model.load_model`; not an MjModel alone
     :param effects: with their values
     :raises ValueError: nothing tells the MJCF of ``source``, or it has effects that are no numbers of its model, or it
-        is the ``model.xml`` that would be overwritten
+        ``folder`` holds a ``model.xml`` that must not be overwritten: the nominal one, or none of this function's
     :raises FileNotFoundError: an asset is missing
     """
     if overwrites(folder, source):
-        raise ValueError(f"{Path(folder) / 'model.xml'} is the nominal model and would be overwritten; save elsewhere")
+        raise ValueError(
+            f"{Path(folder) / 'model.xml'} is the nominal model, or was not saved here by an earlier trace, and would "
+            "be overwritten; save elsewhere"
+        )
     spec, nominal = load_model(source)
     if spec is None:
         raise ValueError(
@@ -114,11 +117,16 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
 
 
 def overwrites(folder: str | os.PathLike[str], source: ModelSource) -> bool:
-    """Whether a simulator saved to ``folder`` would replace the file of its nominal model."""
+    """Whether a simulator saved to ``folder`` would replace its nominal model, or one that was not saved there so."""
+    saved = Path(folder) / "model.xml"
+    if not saved.is_file():
+        return False
+    if not saved.with_name("effects.json").is_file():
+        return True  # an MjSpec or an environment may well be of that file
     if not isinstance(source, str | os.PathLike) or str(source).lstrip().startswith("<"):
         return False
-    file, saved = Path(source).expanduser(), Path(folder) / "model.xml"
-    return file.is_file() and saved.is_file() and saved.samefile(file)
+    file = Path(source).expanduser()
+    return file.is_file() and saved.samefile(file)
 
 
 def load_corrected(folder: str | os.PathLike[str]) -> Corrected:

@@ -313,10 +313,16 @@ def test_files_that_mujoco_does_not_read_are_refused(tmp_path, monkeypatch):
 
 def test_the_nominal_model_is_not_overwritten(tmp_path):
     (tmp_path / "model.xml").write_text(PLAIN)
-    with pytest.raises(ValueError, match="is the nominal model and would be overwritten; save elsewhere"):
-        save_corrected(tmp_path, tmp_path / "model.xml", [])
+    for source in (tmp_path / "model.xml", mujoco.MjSpec.from_file(str(tmp_path / "model.xml"))):
+        with pytest.raises(
+            ValueError, match=r"is the nominal model, or was not saved here by an earlier trace.*elsewhere"
+        ):
+            save_corrected(tmp_path, source, [])
     assert (tmp_path / "model.xml").read_text() == PLAIN
-    save_corrected(tmp_path, PLAIN, [])  # what an earlier save left is another matter
+    save_corrected(tmp_path / "out", PLAIN, [])
+    save_corrected(tmp_path / "out", PLAIN, [])  # what an earlier save left is another matter
+    with pytest.raises(ValueError, match="elsewhere"):
+        save_corrected(tmp_path / "out", tmp_path / "out" / "model.xml", [])
 
 
 def test_torn_folders_are_refused(tmp_path):
