@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 FIRST, AGAIN = 200, 200
 #: Another trace is due when the one-step error of new transitions is so many times that after the last.
 RISEN = 2.0
+#: Smaller errors, in units of a typical step's change, are the rounding of observations.
+ROUNDING = 1e-6
 #: And, where the last one did not account for everything, when there are so many times as many transitions.
 MORE = 2
 #: Samples in a window: several steps show what acts late, and contacts do not amplify errors yet.
@@ -103,7 +105,8 @@ class LoopCloser:
         blurred = dynamics.observation_noise is not None and self._traced_at < ENOUGH
         if more and (blurred or not self.found or self.found[-1]["verdict"] not in SETTLED):
             return True
-        return dynamics.error(model.transitions("target").take(slice(size - new, None))) > RISEN * self._error
+        error = dynamics.error(model.transitions("target").take(slice(size - new, None)))
+        return error > max(RISEN * self._error, ROUNDING)
 
     def first_comes_after(self, model: TwoWorlds) -> int:
         """How many target steps the first trace still waits for; 0 or less where it is due or was made."""

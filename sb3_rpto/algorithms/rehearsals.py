@@ -53,7 +53,6 @@ class Rehearsals:
 
     def rehearse(self, model: Looping, dynamics: PhysicalDynamics) -> None:
         """Play, and keep the policy if it is the best so far."""
-        self._at_update = model._n_updates
         normaliser = model.get_vec_normalize_env()  # where its statistics move, so does what the best one earns
         if self._has_moved(dynamics) or (normaliser is not None and normaliser.training):
             self._rehearse_best(model, dynamics)
@@ -63,6 +62,7 @@ class Rehearsals:
         if self.last >= self.best:
             self._is_best(returns)
             model.take_snapshot("simulator")
+        self._at_update = model._n_updates  # not before: an interrupted one is played again
 
     def clearly_worse(self) -> bool:
         """Whether the last policy earned much less than the best one, and more so than episodes differ."""

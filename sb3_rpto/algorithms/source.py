@@ -206,8 +206,10 @@ class SimulatorSource(EpisodeSource):
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Continue where :meth:`get_state` was called; episodes begin anew where the simulators cannot be restored."""
+        effects = self.dynamics.effects()
         for copy, values in zip(self.copies, state["phis"]):
-            copy.set_effects([e.with_values(v) for e, v in zip(self.dynamics.effects(), values)])
+            if list(map(len, values)) == [len(e.values) for e in effects]:  # else a trace has changed them since
+                copy.set_effects([e.with_values(v) for e, v in zip(effects, values)])
         self._phi, self._rng.bit_generator.state = state["phi"], state["rng"]
         self.dynamics.generator.set_state(state["seeds"])  # this source was built anew, and drew some
         if state["simulators"] is not None:

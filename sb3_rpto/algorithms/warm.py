@@ -79,6 +79,12 @@ def carry_over(sac: SAC, model: Resumable, temperature: bool = True) -> None:
             "policy is another action now",
             stacklevel=3,
         )
+    if sac.get_vec_normalize_env() is not None and model.get_vec_normalize_env() is None:
+        warnings.warn(
+            "source_model saw observations normalised by VecNormalize, and env is in none: the policy will see others; "
+            "pass env in a VecNormalize with those statistics",
+            stacklevel=3,
+        )
     try:
         model.policy.load_state_dict(sac.policy.state_dict())
     except RuntimeError as error:
@@ -288,8 +294,9 @@ def _rewards(model: Resumable, arrays: dict[str, np.ndarray]) -> np.ndarray:
     reward_fn = model.dynamics_kwargs.get("reward_fn") or task_rules(model.env).reward_fn
     if reward_fn is None:
         raise ValueError(
-            "target_data holds no rewards and the task's are not known; record them (rew) or pass "
-            "dynamics_kwargs={'reward_fn': f} with f(observations, actions, next_observations) -> (n,)"
+            "target_data holds no rewards and the task's are not known; record them (rew) or, with "
+            "dynamics='ensemble', pass dynamics_kwargs={'reward_fn': f} with f(observations, actions, "
+            "next_observations) -> (n,)"
         )
     data = as_transitions({**arrays, "rewards": arrays["terminations"]}, model.policy, model.device)
     return reward_fn(data.observations, data.actions, data.next_observations).cpu().numpy()

@@ -1031,3 +1031,29 @@ def test_a_checkpoint_of_a_log_goes_on_in_a_target_without_a_word_of_its_state(s
         warnings.filterwarnings("error", message=".*cannot restore its state")
         made.learn(45, reset_num_timesteps=False)
     assert made.target_spent == {"learning": 45}
+
+
+def test_a_rehearsal_that_was_interrupted_is_played_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = forgetful()
+    assert made.loop is not None
+    made._n_updates += 10
+    with monkeypatch.context() as patch:
+        patch.setattr(made.loop.rehearsals, "_play", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            made.loop.rehearse(made)
+    assert made.loop.rehearsals.is_behind(made)
+
+
+def interrupt(*_: object) -> np.ndarray:
+    raise KeyboardInterrupt
+
+
+def test_rounding_alone_is_no_reason_for_another_trace(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(closing, "AGAIN", 20)
+    made = filled([], 120)
+    assert made.loop is not None
+    made.loop._traced_at, made.loop._error, made.loop.found = 80, 1e-12, [{"verdict": "complete"}]
+    monkeypatch.setattr(PhysicalDynamics, "error", lambda *_: 5e-12)
+    assert not made.loop.due(made, dynamics(made))
+    monkeypatch.setattr(PhysicalDynamics, "error", lambda *_: 5e-3)
+    assert made.loop.due(made, dynamics(made))

@@ -188,3 +188,13 @@ def test_loading_refuses_what_it_cannot_change(name: str, tmp_path: Any) -> None
     simulated(gym.make(POLE)).save(tmp_path / "model.zip")
     with pytest.raises(ValueError, match=rf"load\(\) does not change {name}"):
         RPTO.load(tmp_path / "model.zip", **{name: True})
+
+
+def test_a_source_policys_forgotten_normalisation_is_told() -> None:
+    normalised = VecNormalize(DummyVecEnv([pendulum]))
+    source = SAC("MlpPolicy", normalised, learning_starts=10, device="cpu", policy_kwargs=SMALL_POLICY).learn(20)
+    with pytest.warns(UserWarning, match="normalised by VecNormalize, and env is in none"):
+        warm(source)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        RPO.from_source(source, normalised, pendulum(12.0), device="cpu")
