@@ -336,10 +336,11 @@ class TwoWorlds(PolicySnapshots):
             check_finite("target", observation=np.asarray(info["terminal_observation"]))
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         assert self.target_env is not None
-        side = self.replay_buffer.target
-        for i in np.flatnonzero(dones):  # SB3's are clipped where they were normalised
-            row = (side.pos - len(dones) + i) % side.buffer_size
-            side.next_observations[row, 0] = raw_terminal(self.target_env, i, infos[i]["terminal_observation"])
+        if unwrap_vec_normalize(self.target_env) is not None:  # what SB3 stores is clipped then
+            side = self.replay_buffer.target
+            for i in np.flatnonzero(dones):
+                row = (side.pos - len(dones) + i) % side.buffer_size
+                side.next_observations[row, 0] = raw_terminal(self.target_env, i, infos[i]["terminal_observation"])
         find_ledger(self.target_env).unstored = False
         if self._null_check is not None:
             self._compare_with_source(self._null_check, buffer_action, dones)
