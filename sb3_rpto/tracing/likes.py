@@ -9,7 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
-from sb3_rpto.tracing.evidence import GAIN
+from sb3_rpto.tracing.evidence import GAIN, NOTHING
 from sb3_rpto.tracing.identify import Fit
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.select import REFIT, SEEMS, Model, Selection, Selector
@@ -129,6 +129,8 @@ class Likes:
 
         They may be fewer then: sensors of many joints that look late answer to a few commands that are.
         """
+        if model.errors.max() < NOTHING:  # nothing could seem better
+            return model
         for kind in sorted({*self.kinds} - {"declared"}):
             like = LIKE if kind in {self.kinds[e] for e in model.effects} else AKIN
             same = self._excited(kind)
@@ -146,6 +148,8 @@ class Likes:
                 begin = replace(begin, values=begin.values.copy(), linear=None)
                 begin.values[self.selector.simulation.slices[new]] = moved
             trial = self.selector.model(trial_effects, begin, 2 * REFIT)
+            if self.selector.train.exact:  # where all places change at once, kinks hold the fit
+                trial = self.selector.led_on(trial)
             if self.selector.evidence(trial, model).clear(SEEMS):
                 model = trial
         return model

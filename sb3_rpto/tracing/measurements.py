@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+#: A split is drawn so often before the shortest runs are set apart.
+DRAWS = 100
 
 
 class Noise(NamedTuple):
@@ -267,7 +269,7 @@ class Measurements:
 
         A ``split`` column is honoured. Without one, runs are drawn by seed, at least one for test where there are two.
         Where fewer than three training runs would remain, those for select are added to them and select is empty,
-        which is a finding.
+        which is a finding. Runs differ in length: a draw that sets most samples apart is drawn again.
 
         :param seed: of the draw; the order of the files does not matter
         :param fractions: of the runs for train, select and test; they sum to one
@@ -302,12 +304,27 @@ class Measurements:
                     "use blocks of the training runs"
                 )
                 findings.append(Finding("split", "all episodes", message))
-            order = [runs[i] for i in np.random.default_rng(seed).permutation(n)]
+            lengths = {r: sum(len(e.time) for e in self.episodes if e.run == r) for r in runs}
+            order = _drawn(lengths, n_test + n_select, seed)
             part = {
                 r: "test" if i < n_test else "select" if i < n_test + n_select else "train" for i, r in enumerate(order)
             }
         train, select, test = ([e for e in self.episodes if part[e.run] == name] for name in PARTS)
         return tuple(replace(self, episodes=e, findings=list(findings)) for e in (train, select, test))  # type: ignore[return-value]
+
+
+def _drawn(lengths: dict[str, int], apart: int, seed: int) -> list[str]:
+    """Runs in an order drawn by seed, whose first ``apart`` leave the others at least half the samples due to them.
+
+    :param lengths: number of samples of each run
+    """
+    runs, rng = list(lengths), np.random.default_rng(seed)
+    due = sum(lengths.values()) * (1 - apart / len(runs))
+    for _ in range(DRAWS):
+        order = [runs[i] for i in rng.permutation(len(runs))]
+        if sum(lengths[r] for r in order[apart:]) >= due / 2:
+            return order
+    return sorted(runs, key=lambda r: lengths[r])
 
 
 def _read_csv(path: str) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from sb3_rpto.tracing.evidence import GAIN
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.screen import Screening, screen
-from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
+from sb3_rpto.tracing.select import ENOUGH, INSTEAD, SEEMS, Model, Selection, Selector
 
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
@@ -212,7 +212,10 @@ def search(on: Selectors, base: Model, screening: Screening) -> Selection:
         on = aligned(on, first.model.fit.values)
         rough, begin = on.rough, first.model
         alone, first.model = rough.model((), base.fit), rough.model(begin.effects, begin.fit)
-    if rough.promise(first.model, chosen) < GAIN:  # all together could not be clear
+    if rough.train.exact:
+        first.model = rough.led_on(first.model)
+    met = rough.train.exact and first.model.fit.errors.max() < ENOUGH  # as only what is right meets exact data
+    if met or rough.promise(first.model, chosen) < GAIN:  # all together could not be clear
         return settle(on, first, screening)
     on.say(0.3, f"fitting {len(chosen)} candidates together")
     begins = [model for model in rough.together(chosen, alone.fit, first.model.fit) if model is not None]

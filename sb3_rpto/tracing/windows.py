@@ -23,6 +23,8 @@ MEMORY = 1.0
 EXACT = 1e-4
 #: Least length of a block of windows in s; blocks count as independent.
 BLOCK = 1.0
+#: Some hundred transitions of a simulator are soon over, and no sensor's drift ties them: so many blocks, if shorter.
+ENOUGH_BLOCKS = 8
 #: Longest integration step in s for measured data.
 LONGEST = 0.002
 #: The Runge-Kutta method is stable up to 2.8 for the product of a step and the model's fastest rate; poses differ.
@@ -244,6 +246,7 @@ def _build(
     measured = np.zeros((count, samples, len(observed)))
     block = np.zeros(count, dtype=int)
     last: tuple[int, float] = (-1, 0.0)
+    least = block_length(data, horizon)
     for w, (number, begin, end) in enumerate(starts):
         e = data.episodes[number]
         t0 = e.time[begin]
@@ -263,7 +266,7 @@ def _build(
         at[w] = np.where(np.abs(at[w] - whole) < 1e-3, whole, at[w])
         measured[w, :n] = e.qpos[begin + 1 : end][:, observed]
         usable[w, :n] = e.usable[begin + 1 : end]
-        if number != last[0] or t0 - last[1] >= BLOCK - 1e-9:
+        if number != last[0] or t0 - last[1] >= least - 1e-9:
             last = (number, t0)
             block[w] = block[w - 1] + 1 if w else 0
         else:
@@ -288,6 +291,14 @@ def _build(
         data.touching,
         data.noise is not None,
     )
+
+
+def block_length(data: Measurements, horizon: float) -> float:
+    """Least length of a block of windows of length ``horizon``, in s."""
+    if not data.whole_states:
+        return BLOCK
+    duration = sum(float(e.time[-1] - e.time[0]) for e in data.episodes)
+    return min(BLOCK, max(horizon, duration / ENOUGH_BLOCKS))
 
 
 def held(time: np.ndarray, ctrl: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -410,6 +410,17 @@ def test_seed_changes_the_split_and_file_order_does_not():
     assert [len(m.episodes) for m in data.split(0)] == [6, 2, 2]
 
 
+@given(st.lists(st.integers(6, 200), min_size=2, max_size=8), st.integers(0, 100))
+@settings(max_examples=30, deadline=None)
+def test_a_split_never_sets_most_of_the_data_apart(lengths, seed):
+    tables = {f"run{i}": swing(phase=i, n=n) for i, n in enumerate(lengths)}
+    train, select, test = Measurements.from_tables(tables).split(seed)
+    apart = len(select.episodes) + len(test.episodes)
+    kept = sum(len(e.time) for e in train.episodes)
+    assert kept >= 0.5 * sum(lengths) * (1 - apart / len(lengths))
+    assert test.episodes
+
+
 def test_few_runs_are_a_finding():
     train, select, test = several(4).split(0)
     assert [len(m.episodes) for m in (train, select, test)] == [3, 0, 1]

@@ -12,7 +12,7 @@ from sb3_rpto.effects.names import object_id
 from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.interpolation import interpolate
 from sb3_rpto.tracing.prepare import at_rest
-from sb3_rpto.tracing.windows import EXACT, cut, discretised, noise_levels
+from sb3_rpto.tracing.windows import ENOUGH_BLOCKS, EXACT, cut, discretised, noise_levels
 
 SIGMA = np.array([1e-3])
 
@@ -250,6 +250,23 @@ def test_blocks_are_at_least_as_long_as_asked_for_and_end_with_the_episode() -> 
         if b + 1 in first and windows.episode[windows.block == b][0] == windows.episode[windows.block == b + 1][0]:
             assert first[b + 1] - first[b] >= 1.0 - 1e-6
     assert windows.block[-1] + 1 == 4 + 2
+
+
+def test_a_simulators_short_data_are_parted_into_enough_blocks_and_a_machines_are_not() -> None:
+    """200 transitions of 8 ms: two blocks of a second would be no evidence for anything."""
+    time = np.arange(201) * 0.008
+    short = replace(ramps([time[:195], 9 + time[195:]]), exact=True)
+    blocks = [
+        len(np.unique(cut(compiled(), data, SIGMA, 0.024, 100).block)) for data in (short, replace(short, exact=False))
+    ]
+    assert blocks[0] >= ENOUGH_BLOCKS
+    assert blocks[1] <= 3
+
+
+def test_a_simulators_long_data_have_blocks_of_a_second() -> None:
+    windows = cut(compiled(), replace(ramps([clock(2_400)]), exact=True), SIGMA, 0.05, 1_000)
+    begins = np.array([windows.time[windows.block == b][0] for b in np.unique(windows.block)])
+    assert np.diff(begins) == pytest.approx(1.0, abs=0.06)
 
 
 def test_most_windows_are_spread_over_all_episodes() -> None:
