@@ -18,6 +18,8 @@ from sb3_rpto.tracing.select import ENOUGH, INSTEAD, SEEMS, Model, Selection, Se
 
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
+#: Exact data that typically err by less, in units of the noise, may only be held by kinks.
+NEARLY = 10.0
 #: Finer steps in time are taken where they lower R by this share: then the steps, not the model, make it.
 FINER = 0.03
 
@@ -195,7 +197,8 @@ def worth_a_look(selector: Selector, screening: Screening) -> list[int]:
 def search(on: Selectors, base: Model, screening: Screening) -> Selection:
     """A look for single effects, joint fit of all candidates, elimination backwards, substitution by like ones.
 
-    The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there.
+    The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there. Single
+    effects with which exact data are met need no other.
     Where it ends far from the noise and no nearer than the declared parameters alone, or worse than those few, the best
     few kinds at all their places take its place, and where they do no better either, effects are added one by one.
 
@@ -212,9 +215,10 @@ def search(on: Selectors, base: Model, screening: Screening) -> Selection:
         on = aligned(on, first.model.fit.values)
         rough, begin = on.rough, first.model
         alone, first.model = rough.model((), base.fit), rough.model(begin.effects, begin.fit)
-    if rough.train.exact:
+    nearly = rough.train.exact and np.median(first.model.errors) < NEARLY
+    if nearly:
         first.model = rough.led_on(first.model)
-    met = rough.train.exact and first.model.fit.errors.max() < ENOUGH  # as only what is right meets exact data
+    met = nearly and first.model.fit.errors.max() < ENOUGH  # as only what is right meets exact data
     if met or rough.promise(first.model, chosen) < GAIN:  # all together could not be clear
         return settle(on, first, screening)
     on.say(0.3, f"fitting {len(chosen)} candidates together")
