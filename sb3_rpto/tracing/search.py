@@ -197,8 +197,9 @@ def worth_a_look(selector: Selector, screening: Screening) -> list[int]:
 def search(on: Selectors, base: Model, screening: Screening) -> Selection:
     """A look for single effects, joint fit of all candidates, elimination backwards, substitution by like ones.
 
-    The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there. Single
-    effects with which exact data are met need no other.
+    The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there.
+    Single effects with which exact data are met need no others.
+
     Where it ends far from the noise and no nearer than the declared parameters alone, or worse than those few, the best
     few kinds at all their places take its place, and where they do no better either, effects are added one by one.
 
