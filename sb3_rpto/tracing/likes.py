@@ -148,7 +148,7 @@ class Likes:
                 begin = replace(begin, values=begin.values.copy(), linear=None)
                 begin.values[self.selector.simulation.slices[new]] = moved
             trial = self.selector.model(trial_effects, begin, 2 * REFIT)
-            if self.selector.train.exact:  # where all places change at once, kinks hold the fit
+            if self.selector.nearly_met(trial):  # where all places change at once, kinks hold the fit
                 trial = self.selector.led_on(trial)
             if self.selector.evidence(trial, model).clear(SEEMS):
                 model = trial

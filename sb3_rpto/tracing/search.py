@@ -18,8 +18,6 @@ from sb3_rpto.tracing.select import ENOUGH, INSTEAD, SEEMS, Model, Selection, Se
 
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
-#: Exact data that typically err by less, in units of the noise, may only be held by kinks.
-NEARLY = 10.0
 #: Finer steps in time are taken where they lower R by this share: then the steps, not the model, make it.
 FINER = 0.03
 
@@ -216,7 +214,7 @@ def search(on: Selectors, base: Model, screening: Screening) -> Selection:
         on = aligned(on, first.model.fit.values)
         rough, begin = on.rough, first.model
         alone, first.model = rough.model((), base.fit), rough.model(begin.effects, begin.fit)
-    nearly = rough.train.exact and np.median(first.model.errors) < NEARLY
+    nearly = rough.nearly_met(first.model)
     if nearly:
         first.model = rough.led_on(first.model)
     met = nearly and first.model.fit.errors.max() < ENOUGH  # as only what is right meets exact data

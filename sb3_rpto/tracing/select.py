@@ -19,6 +19,8 @@ from sb3_rpto.tracing.windows import Windows
 THRESHOLD = 3.5
 #: Typical window error, in units of the noise, above which it is the model's more than the noise's.
 FAR = 2.0
+#: A model of exact data that typically errs by less may only be held by kinks.
+NEARLY = 10.0
 #: t* there: what else lacks, not the noise, spreads the blocks, and the 98 % quantile of one test is the best there is.
 LIKELY = 2.0
 #: Share of the error that counts there: of the many effects that would fit a little of what lacks, few are named.
@@ -225,6 +227,10 @@ class Selector:
     def far(self, model: Model) -> bool:
         """Whether what a model lacks, and not the noise, makes its errors."""
         return bool(np.median(model.errors) > FAR)
+
+    def nearly_met(self, model: Model) -> bool:
+        """Whether exact data may be met by leading a model on."""
+        return self.train.exact and bool(np.median(model.errors) < NEARLY)
 
     def limit(self, model: Model) -> tuple[float, float]:
         """The t and the gain that an effect of a model must exceed to stay."""
