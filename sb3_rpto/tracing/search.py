@@ -198,8 +198,9 @@ def search(on: Selectors, base: Model, screening: Screening) -> Selection:
     The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there.
     Single effects with which exact data are met need no others.
 
-    Where it ends far from the noise and no nearer than the declared parameters alone, or worse than those few, the best
-    few kinds at all their places take its place, and where they do no better either, effects are added one by one.
+    Where the joint fit ends far from the noise and no nearer than the declared parameters alone, or worse than those,
+    the best few kinds at all their places take its place, and where they do no better either, effects are added one by
+    one.
 
     :param on: windows
     :param base: the declared parameters alone
