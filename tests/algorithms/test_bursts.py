@@ -99,10 +99,10 @@ def test_a_tensor_of_another_device_would_be_noticed(made, reads, monkeypatch):
 @pytest.fixture
 def ensemble(monkeypatch):
     monkeypatch.setattr(th, "Generator", Stream)
-    model = pendulum()
+    env = pendulum()
     return EnsembleDynamics(
-        model.observation_space,
-        model.action_space,
+        env.observation_space,
+        env.action_space,
         hidden=(8, 8),
         n_members=3,
         n_elites=2,
