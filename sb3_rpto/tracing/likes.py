@@ -66,10 +66,10 @@ class Likes:
     def merge(self, selection: Selection) -> Selection:
         """Try one effect in the place of two: the joint fit may have met its like by a mixture.
 
-        Far from the noise it is not worth its time: neither the two nor the one are right.
+        Far from the noise it is not worth its time: neither the two nor the one are right. No mixture meets exact data.
         """
         current, selector = selection.model, self.selector
-        if selector.far(current):
+        if selector.far(current) or selector.met(current):
             return selection
         pairs = sorted(combinations(current.effects, 2), key=lambda pair: -self.screening.cosine[pair])[:MERGES]
         for pair in pairs:

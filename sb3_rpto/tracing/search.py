@@ -14,7 +14,7 @@ from sb3_rpto.tracing.evidence import GAIN
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.screen import Screening, screen
-from sb3_rpto.tracing.select import ENOUGH, INSTEAD, SEEMS, Model, Selection, Selector
+from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
 
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
@@ -193,10 +193,10 @@ def worth_a_look(selector: Selector, screening: Screening) -> list[int]:
 
 
 def search(on: Selectors, base: Model, screening: Screening) -> Selection:
-    """A look for single effects, joint fit of all candidates, elimination backwards, substitution by like ones.
+    """Looks for one kind and for single effects, joint fit of all candidates, elimination, substitution by like ones.
 
     The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there.
-    Single effects with which exact data are met need no others.
+    Where one kind or single effects meet exact data, nothing else is needed.
 
     Where the joint fit ends far from the noise and no nearer than the declared parameters alone, or worse than those,
     the best few kinds at all their places take its place, and where they do no better either, effects are added one by
@@ -208,6 +208,12 @@ def search(on: Selectors, base: Model, screening: Screening) -> Selection:
     """
     rough, looked_at = on.rough, worth_a_look(on.fine, screening)
     alone = rough.model((), base.fit)
+    if rough.train.exact:
+        on.say(0.2, "looking for a single kind")
+        excited = [i for i, e in enumerate(rough.simulation.effects) if not e.known and screening.excited(i)]
+        one = rough.one_kind(excited, alone.fit)
+        if one is not None:
+            return settle(on, Selection(one), screening)
     on.say(0.2, "looking for single effects")
     first = rough.look_forward(Selection(alone), looked_at, alike=screening.alike)
     chosen = sorted({*worth_fitting(on.fine, screening), *first.model.effects})
@@ -215,11 +221,9 @@ def search(on: Selectors, base: Model, screening: Screening) -> Selection:
         on = aligned(on, first.model.fit.values)
         rough, begin = on.rough, first.model
         alone, first.model = rough.model((), base.fit), rough.model(begin.effects, begin.fit)
-    nearly = rough.nearly_met(first.model)
-    if nearly:
+    if rough.nearly_met(first.model):
         first.model = rough.led_on(first.model)
-    met = nearly and first.model.fit.errors.max() < ENOUGH  # as only what is right meets exact data
-    if met or rough.promise(first.model, chosen) < GAIN:  # all together could not be clear
+    if rough.met(first.model) or rough.promise(first.model, chosen) < GAIN:  # all together could not be clear
         return settle(on, first, screening)
     on.say(0.3, f"fitting {len(chosen)} candidates together")
     begins = [model for model in rough.together(chosen, alone.fit, first.model.fit) if model is not None]
