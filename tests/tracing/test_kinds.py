@@ -1,0 +1,75 @@
+"""One kind of effect at all its places: what meets exact data needs no others."""
+
+import numpy as np
+import pytest
+from simulated import WITH_WHEEL, compiled, problem, recorded
+
+from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.forces import TorqueOffset
+from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction, ViscousFriction
+from sb3_rpto.tracing.screen import screen
+from sb3_rpto.tracing.search import Selectors, search
+from sb3_rpto.tracing.select import THRESHOLD, Model, Selector
+
+#: rad that count as noise of exact data
+EXACT = 1e-6
+CANDIDATES: list[Effect] = [
+    StribeckFriction("hinge"),
+    CoulombFriction("hinge"),
+    TorqueOffset("hinge"),
+    ViscousFriction("hinge"),
+]
+STRIBECK, COULOMB, OFFSET, VISCOUS = range(4)
+
+
+def selector(planted: list[Effect], exact: bool = True) -> Selector:
+    data = recorded(planted, noise=0.0 if exact else 1e-3, exact=exact)
+    train = problem(CANDIDATES, data, noise=EXACT if exact else 1e-3)
+    return Selector(train, None, THRESHOLD, lambda share, what: None)
+
+
+def base(s: Selector) -> Model:
+    return s.model((), s.train.score(s.train.null))
+
+
+@pytest.mark.parametrize(
+    ("planted", "found"),
+    [(CoulombFriction("hinge", level=0.08), COULOMB), (ViscousFriction("hinge", coefficient=0.03), VISCOUS)],
+    ids=["friction", "damping"],
+)
+def test_the_simplest_kind_that_meets_exact_data_is_taken(planted: Effect, found: int) -> None:
+    """Stribeck friction contains the other two, so it meets them as well."""
+    s = selector([planted])
+    model = s.one_kind(range(4), base(s).fit)
+    assert model is not None
+    assert model.effects == (found,)
+    assert s.met(model)
+    assert model.fit.values[s.simulation.slices[found]] == pytest.approx(planted.values, rel=1e-4)
+
+
+def test_no_kind_alone_meets_what_two_have_done() -> None:
+    s = selector([CoulombFriction("hinge", level=0.08), TorqueOffset("hinge", offset=0.1)])
+    assert s.one_kind(range(4), base(s).fit) is None
+
+
+def test_a_kind_that_meets_exact_data_ends_the_search_before_single_effects_are_looked_for() -> None:
+    s = selector([CoulombFriction("hinge", level=0.08)])
+    s.look_forward = None  # type: ignore[method-assign, assignment]
+    begun = base(s)
+    selection = search(Selectors(s, s, lambda share, what: None), begun, screen(s.train, begun.fit))
+    assert selection.model.effects == (COULOMB,)
+
+
+def test_noisy_data_are_never_met() -> None:
+    s = selector([CoulombFriction("hinge", level=0.08)], exact=False)
+    model = s.model([COULOMB], base(s).fit)
+    assert np.median(model.errors) < 2
+    assert not s.met(model)
+
+
+def test_driven_joints_are_a_kind_apart() -> None:
+    model = compiled(WITH_WHEEL)
+    effects = [CoulombFriction("axle"), CoulombFriction("hinge"), TorqueOffset("axle")]
+    s = Selector(problem(effects, recorded(model=model), model), None, THRESHOLD, lambda share, what: None)
+    assert list(s._by_kind([0, 1, 2], apart=True).values()) == [[0], [1], [2]]
+    assert list(s._by_kind([0, 1, 2]).values()) == [[0, 1], [2]]
