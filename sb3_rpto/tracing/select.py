@@ -166,7 +166,7 @@ class Selector:
         nearest = sorted(fits.values(), key=lambda found: found[1].cost)[:KINDS]
         for places, fit in sorted(nearest, key=lambda found: len(self.free(found[0]))):
             begin = concentrated(self.train, fit, self.free(places))
-            if np.median(begin.errors) < NEARLY:
+            if np.median(begin.errors) < TENTH * np.median(base.errors):  # else kinks are not all that holds it
                 model = self.led_on(self.model(places, begin))
                 if self.met(model):
                     return model
