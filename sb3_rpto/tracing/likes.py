@@ -9,7 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
-from sb3_rpto.tracing.evidence import GAIN, NOTHING
+from sb3_rpto.tracing.evidence import GAIN
 from sb3_rpto.tracing.identify import Fit
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.select import REFIT, SEEMS, Model, Selection, Selector
@@ -129,7 +129,7 @@ class Likes:
 
         They may be fewer then: sensors of many joints that look late answer to a few commands that are.
         """
-        if model.errors.max() < NOTHING:  # nothing could seem better
+        if self.selector.met(model):  # nothing could be better
             return model
         for kind in sorted({*self.kinds} - {"declared"}):
             like = LIKE if kind in {self.kinds[e] for e in model.effects} else AKIN
