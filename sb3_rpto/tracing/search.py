@@ -88,7 +88,7 @@ def find(
         on.say(0.2, f"calibrating on {calibrate} complete sets")
         t = calibrated(on.rough, on.rough.model((), base.fit).fit, worth_fitting(on.fine, screening), calibrate, seed)
         on.fine.threshold = on.rough.threshold = t
-    selection = search(on, base, screening)
+    selection = search(on, base, screening, seed)
     if longer is not None and on.fine.far(selection.model):
         on.say(0.75, "looking at longer windows")
         then = selectors(longer)
@@ -192,11 +192,12 @@ def worth_a_look(selector: Selector, screening: Screening) -> list[int]:
     return sorted({*chosen, *shaped})
 
 
-def search(on: Selectors, base: Model, screening: Screening) -> Selection:
+def search(on: Selectors, base: Model, screening: Screening, seed: int = 0) -> Selection:
     """Looks for one kind and for single effects, joint fit of all candidates, elimination, substitution by like ones.
 
     The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there.
-    Where one kind or single effects meet exact data, nothing else is needed.
+    Where one kind or single effects meet exact data, nothing else is needed. One kind is looked for in measured data
+    too, where contacts hold larger fits in kinks and the declared parameters alone are far from the noise.
 
     Where the joint fit ends far from the noise and no nearer than the declared parameters alone, or worse than those,
     the best few kinds at all their places take its place, and where they do no better either, effects are added one by
@@ -205,15 +206,18 @@ def search(on: Selectors, base: Model, screening: Screening) -> Selection:
     :param on: windows
     :param base: the declared parameters alone
     :param screening: of the candidates
+    :param seed: of the resampling
     """
     rough, looked_at = on.rough, worth_a_look(on.fine, screening)
     alone = rough.model((), base.fit)
-    if rough.train.exact:
+    if rough.train.exact or (rough.train.touching and rough.far(alone)):
         on.say(0.2, "looking for a single kind")
         excited = [i for i, e in enumerate(rough.simulation.effects) if not e.known and screening.excited(i)]
         one = rough.one_kind(excited, alone.fit)
         if one is not None:
-            return settle(on, Selection(one), screening)
+            selection = settle(on, Selection(one), screening)
+            enough = rough.train.exact or judged(on.fine, selection.model, seed).adequate
+            return selection if enough else go_on(on, selection, screening)
     on.say(0.2, "looking for single effects")
     first = rough.look_forward(Selection(alone), looked_at, alike=screening.alike)
     chosen = sorted({*worth_fitting(on.fine, screening), *first.model.effects})

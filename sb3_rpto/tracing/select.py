@@ -154,7 +154,7 @@ class Selector:
         return self.model(effects, best), few
 
     def one_kind(self, effects: Sequence[int], base: Fit) -> Model | None:
-        """The kind that meets exact data at all its places, if there is one, the simplest of the few nearest.
+        """The kind that alone accounts for the data, at all its places, if there is one: the simplest of the nearest.
 
         :param effects: indices of the candidates
         :param base: the declared parameters alone
@@ -166,9 +166,9 @@ class Selector:
         nearest = sorted(fits.values(), key=lambda found: found[1].cost)[:KINDS]
         for places, fit in sorted(nearest, key=lambda found: len(self.free(found[0]))):
             begin = concentrated(self.train, fit, self.free(places))
-            if np.median(begin.errors) < TENTH * np.median(base.errors):  # else kinks are not all that holds it
+            if np.median(begin.errors) < max(FAR, TENTH * np.median(base.errors)):  # else kinks are not all it lacks
                 model = self.led_on(self.model(places, begin))
-                if self.met(model):
+                if self.met(model) if self.train.exact else not self.far(model):
                     return model
         return None
 
