@@ -39,7 +39,7 @@ SETTLED = ("complete", "explained")
 VAGUE = 0.9
 #: Commands one sample earlier that leave less than this share of the error were logged after they had acted.
 EARLY = 0.5
-_NEVER = "adding it lowers the error of unseen windows by nothing clear"
+_NEVER = "beside what is kept it lowers the error of unseen windows by nothing clear"
 #: Most iterations of the last fits: where two parameters do nearly the same, a descent goes slowly along their valley.
 FINAL = 40
 
