@@ -395,9 +395,13 @@ def outdated(model: Looping, dynamics: PhysicalDynamics) -> bool:
 
 
 def renew_source(model: Looping) -> None:
-    """Drop what another simulator produced, and take the first :data:`FILL` steps in the present one."""
+    """Drop what another simulator produced, and take the first :data:`FILL` steps in the present one.
+
+    They begin with episodes: of one under way the commands before it are dropped too, which late motors still act on.
+    """
     assert model._source_world is not None
     model.replay_buffer.source.reset()
+    model._source_world.begin_anew()
     model.source_timesteps += model._source_world.interact(model, FILL)
 
 

@@ -42,6 +42,9 @@ class SourceWorld(ABC):
         """What to log of the source's episodes; empty where it has none."""
         return {}
 
+    def begin_anew(self) -> None:  # noqa: B027
+        """Leave the episodes under way: the next step is the first of others."""
+
     def get_state(self) -> dict[str, Any]:
         """Where the episodes stand, beside the source environment's own state; empty where there are none."""
         return {}
@@ -141,6 +144,10 @@ class EpisodeSource(SourceWorld):
         if not self.returns:
             return {}
         return {"ep_rew_mean": float(np.mean(self.returns)), "ep_len_mean": float(np.mean(self.lengths))}
+
+    def begin_anew(self) -> None:
+        """See :meth:`SourceWorld.begin_anew`."""
+        self._last_obs = self._last_raw = None
 
     def get_state(self) -> dict[str, Any]:
         """Where the episodes stand; see :meth:`SourceWorld.get_state`."""

@@ -22,7 +22,7 @@ from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPTO, RTO
 from sb3_rpto.algorithms import arguments, closing
-from sb3_rpto.algorithms.closing import LoopCloser, outdated, stays_finite
+from sb3_rpto.algorithms.closing import LoopCloser, outdated, renew_source, stays_finite
 from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.physical import PhysicalDynamics
@@ -342,6 +342,14 @@ def test_what_other_declared_numbers_produced_is_dropped_too(soon: None) -> None
     assert not outdated(made, dynamics(made))
     made.loop.close(made, dynamics(made))  # the source stays as it is where the simulator does
     assert learned_from() == made.replay_buffer.source.size()
+
+
+def test_renewed_data_are_the_simulators_own_where_commands_are_late() -> None:
+    late = LIBRARY["command_delay"]("slide", delay=0.05).to_json()
+    made = model([], dynamics_kwargs={"effects": [late]})
+    made.learn(1, source_timesteps=63)
+    renew_source(made)
+    assert not outdated(made, dynamics(made))
 
 
 def test_an_unstable_correction_is_refused(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
