@@ -240,7 +240,7 @@ class TwoWorlds(PolicySnapshots):
     ) -> tuple[int, BaseCallback]:
         """As SB3's, with the last observation and the action noise belonging to the target."""
         starts_episode = reset_num_timesteps or self._last_obs is None
-        disturbed = self.target_env is not None and find_ledger(self.target_env).disturbed
+        disturbed = self.target_env is not None and find_ledger(self.target_env).lost(warn=not starts_episode)
         noise, self.action_noise = self.action_noise, None  # SB3 would size it by the source
         try:
             total_timesteps, callback = super()._setup_learn(

@@ -60,8 +60,6 @@ class Resumable(TwoWorlds):
         include: Iterable[str] | None = None,
     ) -> None:
         """Save all that a resumed run needs, except the replay buffers (``save_replay_buffer``); atomic for paths."""
-        if self.target_env is not None:  # a callback may save in the middle of a rollout
-            self.target_spent = dict(find_ledger(self.target_env).spent)
         loaded = self._resume_state  # a loaded model that has not learned since stands where it was saved first
         learner = self.snapshots.get("learner")
         self._resume_state = {**loaded, "warm": self._warm, "learner": learner} if loaded else capture(self)
@@ -241,6 +239,7 @@ def _put_target_back(model: Resumable, state: dict[str, Any]) -> bool:
     begun = model._last_obs, model._last_original_obs, raw
     restored = _put_back(find_ledger(model.target_env).venv, state["target"])
     model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
+    find_ledger(model.target_env).begin()
     if state["unstored_step"] is not None:
         if normaliser is not None:
             vars(normaliser).update(state["unstored_step"]["raw"])

@@ -413,18 +413,15 @@ class TransferAlgorithm(Looping):
         length, ledger = self._rollout_length(), find_ledger(self.target_env)
         allowance = length.frequency * self.target_env.num_envs
         self._rollout_began_at = self.num_timesteps
-        try:
-            with self._targets_normalisation(), ledger.spending("learning", allowance):
-                rollout = self.collect_rollouts(
-                    self.target_env,
-                    callback,
-                    length,
-                    self.replay_buffer,
-                    action_noise=self.action_noise,
-                    log_interval=log_interval,
-                )
-        finally:
-            self.target_spent = dict(ledger.spent)
+        with self._targets_normalisation(), ledger.spending("learning", allowance):
+            rollout = self.collect_rollouts(
+                self.target_env,
+                callback,
+                length,
+                self.replay_buffer,
+                action_noise=self.action_noise,
+                log_interval=log_interval,
+            )
         if not rollout.continue_training:
             self.store_step(callback.locals)  # SB3 drops the step after which a callback stops
         self._collected = rollout.episode_timesteps

@@ -105,14 +105,12 @@ def fill_source(model: Resumable, source_data: ReplayBuffer | str | pathlib.Path
 
 
 def fill_target(model: Resumable, target_data: ReplayBuffer | str | pathlib.Path | Measurements) -> None:
-    """Put recorded target transitions into D_target; rewards that were not recorded come from the task's reward_fn."""
+    """Put recorded target transitions into D_target, with rewards by :func:`_with_rewards`."""
     if isinstance(target_data, Measurements):
         fill_recorded(model, target_data)
         return
     arrays = _checked(load_transitions(target_data, "target", rewards_optional=True), model, "target_data")
-    if "rewards" not in arrays:
-        arrays["rewards"] = _rewards(model, arrays)
-    _append_newest(model, "target", arrays)
+    _append_newest(model, "target", _with_rewards(model, arrays))
 
 
 def fill_recorded(model: Resumable, measured: Measurements, effects: Sequence[Effect] = ()) -> None:
@@ -134,15 +132,7 @@ def fill_recorded(model: Resumable, measured: Measurements, effects: Sequence[Ef
             raise ValueError(f"{message}: record motion of the task, for longer than a step without gaps")
         warnings.warn(f"{message}: it corrects the simulator, and the policy learns there alone", stacklevel=4)
         return
-    if "rewards" not in arrays:
-        if (model.weighting is not None and not model._traces_log) or model.real_ratio > 0:
-            raise ValueError(
-                "target_data: measurements hold no rewards and the task's are not known, which RTO's weight and the "
-                "critic need; pass weighting=None and real_ratio=0, or, to the ensemble, "
-                "dynamics_kwargs={'reward_fn': f} with f(observations, actions, next_observations) -> (n,)"
-            )
-        arrays["rewards"] = np.zeros(len(arrays["actions"]))
-    _append_newest(model, "target", arrays)
+    _append_newest(model, "target", _with_rewards(model, arrays))
 
 
 def begin_in_source(model: Resumable, source_timesteps: int, progress_bar: bool) -> None:
@@ -285,21 +275,48 @@ def _checked(arrays: dict[str, np.ndarray], model: Resumable, name: str) -> dict
     return arrays
 
 
-def _rewards(model: Resumable, arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """Rewards (n,) of recorded transitions by the reward function that was passed or is known of the task.
+def _with_rewards(model: Resumable, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Recorded transitions with rewards: their own, those of a known rule, or zeros where nothing is to read them.
 
-    :raises ValueError: when there is none
+    A share of target transitions in the critic's batches that nobody asked for is left out then.
+
+    :raises ValueError: there are none, and something needs them
     """
+    if "rewards" in arrays:
+        return arrays
     assert model.env is not None  # target_data is an argument of the constructor, which has one
     reward_fn = model.dynamics_kwargs.get("reward_fn") or task_rules(model.env).reward_fn
-    if reward_fn is None:
-        raise ValueError(
-            "target_data holds no rewards and the task's are not known; record them (rew) or, with "
-            "dynamics='ensemble', pass dynamics_kwargs={'reward_fn': f} with f(observations, actions, "
-            "next_observations) -> (n,)"
+    if reward_fn is not None:
+        data = as_transitions({**arrays, "rewards": arrays["terminations"]}, model.policy, model.device)
+        rewards = reward_fn(data.observations, data.actions, data.next_observations).cpu().numpy()
+        return {**arrays, "rewards": rewards}
+    need = _need_of_rewards(model)
+    if need:
+        raise ValueError(f"target_data holds no rewards, and the task's are not known: {need}")
+    if model.real_ratio > 0:
+        model.real_ratio = 0.0
+        if model.updates_policy:
+            warnings.warn(
+                "target_data holds no rewards, and the task's are not known: real_ratio is 0 from here on, the critic "
+                "learns from the source's transitions alone",
+                stacklevel=5,
+            )
+    return {**arrays, "rewards": np.zeros(len(arrays["actions"]))}
+
+
+def _need_of_rewards(model: Resumable) -> str:
+    """What needs the target's rewards, and the remedy; empty where nothing does."""
+    rule = "{'reward_fn': f} with f(observations, actions, next_observations) -> (n,)"
+    if model.dynamics_backend == "ensemble":
+        return (
+            f"dynamics='ensemble' would learn them; pass dynamics_kwargs={rule}, record them (rew), or take "
+            "dynamics='physical' or 'residual', which earn the source's own"
         )
-    data = as_transitions({**arrays, "rewards": arrays["terminations"]}, model.policy, model.device)
-    return reward_fn(data.observations, data.actions, data.next_observations).cpu().numpy()
+    if model.weighting is not None and not model._traces_log:
+        return "RTO's weight is made of them; pass weighting=None or record them (rew)"
+    if model.real_ratio > 0 and "real_ratio" in model._passed:
+        return "real_ratio is the share of the critic's batches that holds them; pass real_ratio=0 or leave it out"
+    return ""
 
 
 def _append_newest(model: Resumable, world: World, arrays: dict[str, np.ndarray]) -> None:

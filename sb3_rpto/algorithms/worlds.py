@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,28 +14,30 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 
 from sb3_rpto.envs.observations import layers
-from sb3_rpto.envs.state import accepts_seed, copy_env, restore_state, save_state
+from sb3_rpto.envs.state import accepts_seed, copy_env, restore_state, save_state, whereabouts
 
 
 class TargetLedger(VecEnvWrapper):
     """Counts every step of the target by purpose and refuses to go over the budget.
 
     Steps taken inside :meth:`spending` count for the purpose named there, all others (a script that steps the
-    target behind the algorithm's back) as ``"other"``.
+    target behind the algorithm's back) as ``"other"``. Of steps that somebody takes in the environment inside, past
+    this ledger, it can only notice that they were taken.
 
     :param venv: the target
-    :param spent: steps by purpose from an earlier run, continued here
+    :param spent: steps by purpose, counted on in place
     """
 
-    def __init__(self, venv: VecEnv, spent: dict[str, int] | None = None) -> None:
+    def __init__(self, venv: VecEnv, spent: dict[str, int]) -> None:
         super().__init__(venv)
-        self.spent: Counter[str] = Counter(spent or {})
+        self.spent = spent
         #: whether a step was taken whose transition is not stored yet
         self.unstored = False
         #: whether somebody else moved the target since :meth:`begin`
         self.disturbed = False
         self._purpose = "other"
         self._allowance: int | None = None
+        self._left_at: list[tuple[Any, ...]] | None = None
 
     @contextmanager
     def spending(self, purpose: str, allowance: int) -> Iterator[None]:
@@ -50,32 +52,62 @@ class TargetLedger(VecEnvWrapper):
             self._purpose, self._allowance = "other", None
 
     def begin(self) -> None:
-        """The episode that was just begun is the algorithm's."""
+        """The episode that was just begun, or taken up again, is the algorithm's."""
         self.disturbed = False
+        self._left_at = whereabouts(self.venv)
+
+    def lost(self, warn: bool) -> bool:
+        """Whether somebody's steps have ended the episode under way.
+
+        :param warn: where it was to go on, and the steps were not counted
+        """
+        moved = self.moved()
+        if moved and warn:
+            warnings.warn(
+                "the environment that was passed as target_env was stepped or reset since the last learn(): a new "
+                "episode begins, and target_spent does not hold those steps; evaluate in an environment of its own",
+                stacklevel=5,
+            )
+        return moved or self.disturbed
+
+    def moved(self) -> bool:
+        """Whether somebody has stepped or reset the environment inside since its last step here, where that shows."""
+        return self._left_at is not None and self._left_at != whereabouts(self.venv)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Count, then step."""
+        """Count, then step.
+
+        :raises RuntimeError: for a step of the algorithm's over its allowance, or in an episode that somebody moved
+        """
         self.disturbed |= self._allowance is None
         if self._allowance is not None:
+            if self.moved():
+                raise RuntimeError(
+                    "the environment that was passed as target_env was stepped or reset by somebody else since its "
+                    "last step (a callback that evaluates in it?): its episode is lost; evaluate in an environment of "
+                    "its own, and go on by learn(..., reset_num_timesteps=False)"
+                )
             if self._allowance < self.num_envs:
                 raise RuntimeError(
-                    f"the target-step budget is spent: {dict(self.spent)}; a callback that evaluates needs an "
+                    f"the target-step budget is spent: {self.spent}; a callback that evaluates needs an "
                     "environment of its own, not model.target_env"
                 )
             self._allowance -= self.num_envs
-        self.spent[self._purpose] += self.num_envs
+        self.spent[self._purpose] = self.spent.get(self._purpose, 0) + self.num_envs
         self.venv.step_async(actions)
 
     def step_wait(self) -> Any:
         """The target's answer, unchanged."""
         answer = self.venv.step_wait()
-        self.unstored = True  # not before: the step may be interrupted
+        self.unstored, self._left_at = True, whereabouts(self.venv)  # not before: the step may be interrupted
         return answer
 
     def reset(self) -> Any:
         """Reset the target; a reset is not counted as a step."""
         self.unstored, self.disturbed = False, True
-        return self.venv.reset()
+        answer = self.venv.reset()
+        self._left_at = whereabouts(self.venv)
+        return answer
 
 
 def find_ledger(venv: VecEnv) -> TargetLedger:

@@ -97,6 +97,18 @@ class Dynamics(nn.Module, ABC):
     def error(self, data: Transitions) -> float:
         """Root mean squared one-step error on ``data``, in units of each dimension's standard one-step change."""
 
+    @property
+    def attached(self) -> bool:
+        """Whether :meth:`step` has all that it needs."""
+        return True
+
+    def attach(self, env: Any) -> None:
+        """Give the environment that a simulator's rewards and terminations come from; a network needs none."""
+
+    def forgotten(self) -> list[str]:
+        """What :meth:`step`, which answers from one observation, cannot show: effects that remember."""
+        return []
+
     def describe(self) -> dict[str, float]:
         """Named values of phi worth logging (physical parameters); empty for a network."""
         return {}

@@ -46,9 +46,9 @@ def predict(dynamics: Dynamics, observations: np.ndarray, actions: np.ndarray) -
 
 
 def check_dynamics(dynamics: Dynamics, observation_space: spaces.Space, action_space: spaces.Space) -> None:
-    """Refuse a model of another task.
+    """Refuse a model of another task, and one whose steps would lose what acts late.
 
-    :raises ValueError: if the model's spaces have other shapes
+    :raises ValueError: if the model's spaces have other shapes, or an effect of phi remembers
     """
     for name, space in (("observation_space", observation_space), ("action_space", action_space)):
         if getattr(dynamics, name).shape != space.shape:
@@ -56,6 +56,12 @@ def check_dynamics(dynamics: Dynamics, observation_space: spaces.Space, action_s
                 f"dynamics has {name} {getattr(dynamics, name)}, the environment has {space}; "
                 "build the dynamics from this environment's spaces"
             )
+    late = dynamics.forgotten()
+    if late:
+        raise ValueError(
+            f"the model answers each step from its observation alone, where {', '.join(late)} would be lost; the "
+            "corrected simulator itself is sb3_rpto.apply_effects(env, dynamics.effects())"
+        )
 
 
 class DynamicsEnv(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], gym.utils.RecordConstructorArgs):
@@ -69,7 +75,8 @@ class DynamicsEnv(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], g
 
     :param env: the source environment, with flat Box observations and Box actions
     :param dynamics: the model that answers
-    :raises ValueError: if the model's spaces have other shapes than the environment's
+    :raises ValueError: if the model's spaces have other shapes than the environment's, or phi holds effects that act
+        late (delays, lags, play), which an answer from one observation cannot show
     """
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], dynamics: Dynamics) -> None:
@@ -77,6 +84,8 @@ class DynamicsEnv(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], g
         gym.utils.RecordConstructorArgs.__init__(self, dynamics=dynamics, _disable_deepcopy=True)
         gym.Wrapper.__init__(self, env)
         check_dynamics(dynamics, env.observation_space, env.action_space)
+        if not dynamics.attached:
+            dynamics.attach(env)
         self.dynamics = dynamics
         self.metadata = {**env.metadata, "render_modes": []}
         self.max_episode_steps = time_limit(env)

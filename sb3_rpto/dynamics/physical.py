@@ -219,6 +219,15 @@ class PhysicalDynamics(Dynamics):
 
     # ------------------------------------------------------------------ prediction
 
+    def forgotten(self) -> list[str]:
+        """Labels of the effects that remember: commands and states from before a step count as the same."""
+        return [effect.label for effect in self.effects() if effect.remembers]
+
+    @property
+    def attached(self) -> bool:
+        """Whether :meth:`attach` was called."""
+        return self._twin is not None
+
     def attach(self, env: gym.Env | VecEnv) -> None:
         """Give the environment whose rewards, terminations and observations :meth:`step` answers with; it is copied.
 

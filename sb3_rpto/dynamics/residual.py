@@ -91,6 +91,15 @@ class ResidualDynamics(Dynamics):
         self.physical.seed(seed)
         self.ensemble.seed(seed)
 
+    def forgotten(self) -> list[str]:
+        """As in :class:`PhysicalDynamics`."""
+        return self.physical.forgotten()
+
+    @property
+    def attached(self) -> bool:
+        """Whether :meth:`attach` was called."""
+        return self.physical.attached
+
     def attach(self, env: gym.Env | VecEnv) -> None:
         """Give the environment that the simulator answers for; see :meth:`PhysicalDynamics.attach`.
 

@@ -188,6 +188,14 @@ class Effect:
         """Whether the effect is on a sensor."""
         return self.overrides("observe") or self.overrides("late")
 
+    @property
+    def remembers(self) -> bool:
+        """Whether what it does follows from more than the present state and command, as with delays."""
+        memory: dict[str, Any] = {}
+        if self.overrides("command"):
+            self.command(np.zeros(1), self.values[None], memory, 1e-3)
+        return bool(memory) or self.overrides("late")
+
     def overrides(self, hook: str) -> bool:
         """Whether the effect acts by ``hook``."""
         return getattr(type(self), hook) is not getattr(Effect, hook)

@@ -212,6 +212,29 @@ def _restore_simulation(base: gym.Env, saved: dict[str, Any]) -> None:
         mujoco.mj_copyData(base.data, base.model, pickle.loads(saved["simulation"]))  # type: ignore[attr-defined]
 
 
+def whereabouts(env: VecEnv) -> list[tuple[Any, ...]]:
+    """Where the episodes of ``env`` stand, as far as that is cheap to tell: equal while nobody steps or resets it.
+
+    Told are gymnasium's step counters, and the states of its MuJoCo tasks and classic tasks. Nothing is asked of other
+    environments: a robot moves by itself.
+
+    :param env: the environment, untouched
+    :return: for each member of a DummyVecEnv; empty for others
+    """
+    base = env.unwrapped
+    return [_whereabouts(member) for member in base.envs] if type(base) is DummyVecEnv else []
+
+
+def _whereabouts(env: gym.Env) -> tuple[Any, ...]:
+    *around, base = _layers(env)
+    known: list[Any] = [layer._elapsed_steps for layer in around if isinstance(layer, wrappers.TimeLimit)]
+    if type(base) in _ENVS:
+        known.append(np.array(base.state).tobytes())  # type: ignore[attr-defined]
+    elif type(base).__module__.startswith("gymnasium.envs.mujoco."):
+        known += [base.data.time, base.data.qpos.tobytes()]  # type: ignore[attr-defined]
+    return tuple(known)
+
+
 # --- trial copies -----------------------------------------------------------------------------------------------
 
 

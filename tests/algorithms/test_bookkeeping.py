@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 from conftest import ALGORITHMS, small
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_rpto import RPO
+from sb3_rpto.buffers import chronological
 
 
 def short(g=12.0):
@@ -100,3 +102,42 @@ def test_the_best_policy_of_a_target_is_judged_by_its_own_episodes():
     model.learn(140, reset_num_timesteps=False)
     earned = [info["r"] for info in model.ep_info_buffer]
     assert model.best_mean_reward == pytest.approx(max(np.mean(earned[i : i + 5]) for i in range(len(earned) - 4)))
+
+
+def test_steps_that_a_script_takes_in_the_target_are_counted_at_once():
+    model = small(RPO, short(10.0), short()).learn(20, source_timesteps=0)
+    model.target_env.reset()
+    model.target_env.step(np.zeros((1, 1)))
+    assert model.target_spent == {"learning": 20, "other": 1}
+
+
+def test_an_evaluation_in_the_target_itself_makes_up_no_transition():
+    target = short()
+    model = small(RPO, short(10.0), target).learn(11, source_timesteps=0)  # in the middle of an episode
+    evaluate_policy(model, target, 1, warn=False)
+    with pytest.warns(UserWarning, match="target_spent does not hold those steps"):
+        model.learn(9, reset_num_timesteps=False, source_timesteps=0)
+    rows = chronological(model.replay_buffer.target)
+    goes_on = np.isclose(rows["next_observations"][:-1], rows["observations"][1:]).all(axis=1)
+    assert np.flatnonzero(~goes_on).tolist() == [7, 10, 18]  # episodes of 8 steps end, and that of the evaluation began
+    reached = np.arctan2(rows["next_observations"][:, 1], rows["next_observations"][:, 0])
+    left = np.arctan2(rows["observations"][:, 1], rows["observations"][:, 0])
+    turned = (reached - left + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(turned, 0.05 * rows["next_observations"][:, 2], atol=1e-5)  # as a pendulum moves
+
+
+def test_a_callback_that_evaluates_in_the_target_itself_is_stopped():
+    target = short()
+    model = small(RPO, short(10.0), target)
+
+    def evaluate(local, _):
+        if model.num_timesteps == 5:
+            evaluate_policy(model, target, 1, warn=False)
+        return True
+
+    with pytest.raises(RuntimeError, match="stepped or reset by somebody else"):
+        model.learn(20, callback=evaluate, source_timesteps=0)
+    assert model.replay_buffer.target.size() == model.num_timesteps == 5
+    with pytest.warns(UserWarning, match="a new episode begins"):
+        model.learn(15, reset_num_timesteps=False, source_timesteps=0)
+    assert model.replay_buffer.target.size() == model.num_timesteps == 20

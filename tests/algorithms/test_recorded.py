@@ -195,9 +195,20 @@ def test_wrappers_that_a_log_does_not_tell_of_are_refused() -> None:
 
 def test_unknown_rewards_are_not_made_up() -> None:
     env = gym.wrappers.TransformReward(gym.make(TASK), lambda r: r)
-    with pytest.raises(ValueError, match=r"hold no rewards.*real_ratio=0"):
-        model(log(), env=env)
-    made = model(log(), env=env, real_ratio=0.0)
+    with pytest.raises(ValueError, match=r"holds no rewards.*pass real_ratio=0"):
+        model(log(), env=env, real_ratio=0.05)
+    with pytest.warns(UserWarning, match="real_ratio is 0 from here on"):
+        made = model(log(), env=env)
+    assert made.real_ratio == 0.0
+    assert not chronological(made.replay_buffer.target)["rewards"].any()
+
+
+def test_networks_are_not_taught_that_unknown_rewards_are_zero() -> None:
+    env = gym.wrappers.TransformReward(gym.make(TASK), lambda r: r)
+    plain = {"env": env, "declared": (), "weighting": None, "real_ratio": 0.0}
+    with pytest.raises(ValueError, match=r"'ensemble' would learn them.*reward_fn"):
+        model(log(), dynamics="ensemble", **plain)
+    made = model(log(), dynamics="residual", **plain | {"declared": ["hinge.damping"]})
     assert not chronological(made.replay_buffer.target)["rewards"].any()
 
 

@@ -4,6 +4,7 @@ import copy
 import io
 import pickle
 import warnings
+from contextlib import nullcontext
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +14,7 @@ from gymnasium import spaces, wrappers
 from shifted import HOPPER, POLE, POLES, SHIFTS, collect, joined, noisy, shifted
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_rpto.dynamics.env import DynamicsEnv
 from sb3_rpto.dynamics.physical import MAX_TRANSITIONS, PhysicalDynamics
 from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.effects import Declared
@@ -413,6 +415,26 @@ def test_the_error_is_in_standard_one_step_changes(poles):
 def test_steps_need_the_environment():
     with pytest.raises(RuntimeError, match="attach"):
         dynamics(POLE).step(th.zeros(1, 4), th.zeros(1, 1))
+
+
+def test_an_environment_of_the_model_steps_as_the_corrected_one_and_needs_no_more():
+    source, model = gym.make(POLES), dynamics(POLES)
+    model.adopt([e.with_values(np.array([v])) for e, v in zip(model.effects(), SHIFTS[POLES].values())])
+    env, corrected = DynamicsEnv(source, model), apply_effects(source, model.effects())
+    seen, expected = env.reset(seed=3)[0], corrected.reset(seed=3)[0]
+    for _ in range(5):
+        np.testing.assert_allclose(seen, expected, atol=1e-9)
+        seen, expected = env.step(np.array([0.5]))[0], corrected.step(np.array([0.5]))[0]
+
+
+@pytest.mark.parametrize(
+    ("late", "refused"), [(CommandDelay("slide", delay=0.04), True), (CommandGain("slide", change=-0.2), False)]
+)
+def test_an_environment_of_the_model_does_not_lose_what_acts_late(late, refused):
+    model = dynamics(POLE)
+    model.adopt([late])
+    with pytest.raises(ValueError, match=r"command_delay\(slide\).*apply_effects") if refused else nullcontext():
+        DynamicsEnv(gym.make(POLE), model)
 
 
 def test_an_environment_that_cannot_be_copied_is_refused():
