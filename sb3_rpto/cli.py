@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 #: Exit codes: bad input, and interrupted by the user.
 BAD_INPUT, INTERRUPTED = 2, 130
-#: What users can cause is said in one line; an error of ours keeps its traceback, unless it is of these kinds, too.
+#: What users can cause is said in one line; an error of ours keeps its traceback, unless it is of these kinds, too,
+#: and nobody asked for it.
 USER_ERRORS = (ValueError, TypeError, OSError, ImportError)
 #: Readers of recordings by the suffix of their files.
 FORMATS = {"csv": "from_csv", "parquet": "from_parquet", "npz": "from_npz"}
@@ -50,17 +51,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _Parser(prog="sb3-rpto", description="Move policies from a simulator to a target, and say what it lacks.")
     parser.add_argument("--version", action="version", version=f"sb3-rpto {__version__}")
+    parser.add_argument("--traceback", action="store_true", help="where an error arose, in place of one line")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (train.add, transfer.add, enjoy.add, plot.add, _add_trace, _add_benchmark):
         add(commands)
+    traceback = False
     try:
         parsed = parser.parse_args(arguments)
+        traceback = parsed.traceback
         run: Callable[[argparse.Namespace], int] = parsed.run
         return run(parsed)
     except KeyboardInterrupt:
         print("sb3-rpto: interrupted", file=sys.stderr)
         return INTERRUPTED
     except USER_ERRORS as error:
+        if traceback:
+            raise
         print(f"sb3-rpto: error: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
         return BAD_INPUT
 
@@ -207,6 +213,10 @@ def _model(name: str) -> Any:
         raise FileNotFoundError(f"there is no MJCF file {name!r}; check the path")
     import gymnasium as gym
 
+    from sb3_rpto.commands import options
+
+    with contextlib.suppress(ValueError):  # a task's name, or a shift that is not registered
+        return options.world(name, "MODEL").make()
     try:
         return gym.make(name)
     except (gym.error.Error, ModuleNotFoundError) as error:

@@ -107,6 +107,8 @@ def test_a_gymnasium_id_names_a_model() -> None:
     env = cli._model("InvertedPendulum-v5")
     assert isinstance(env.unwrapped.model, mujoco.MjModel)
     assert cli._model("sb3_rpto:InvertedPendulum-v5").spec.id == "InvertedPendulum-v5"
+    heavier = cli._model("rpto/Hopper-gravity-x3-v0")  # registered nowhere
+    assert heavier.unwrapped.model.opt.gravity[2] == 3 * cli._model("Hopper").unwrapped.model.opt.gravity[2]
 
 
 def test_files_of_several_formats_are_refused(files: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from numbers import Integral
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
@@ -17,11 +17,14 @@ from sb3_rpto.algorithms.bookkeeping import TwoWorlds
 from sb3_rpto.algorithms.worlds import members
 from sb3_rpto.dynamics.factory import BACKENDS, is_mujoco
 from sb3_rpto.dynamics.weights import WEIGHTINGS
-from sb3_rpto.effects import LIBRARY, from_json
+from sb3_rpto.effects import LIBRARY, Effect, from_json
 from sb3_rpto.effects.library import given
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.names import near
 from sb3_rpto.envs.rules import misfit
+
+if TYPE_CHECKING:
+    from sb3_rpto.algorithms.closing import LoopCloser
 
 #: Arguments that only an algorithm with trainable dynamics has a use for.
 DYNAMICS_ARGUMENTS = frozenset(
@@ -42,6 +45,8 @@ CHECKED = (
     *("weighting", "rollout_start", "real_ratio", "weight_floor", "tau", "gamma", "source_steps", "model_train_freq"),
     *("gradient_steps", "target_update_interval", "batch_size", "buffer_size"),
 )
+#: What stands for target steps in an offline run has no use for these.
+ONLINE = frozenset({"action_noise", "train_freq"})
 #: Policy updates that are too few for anything to be learned.
 FEW_UPDATES = 1_000
 #: Goals, Dict observations and n-step returns (SB3's HerReplayBuffer is a DictReplayBuffer).
@@ -73,6 +78,34 @@ def check_one_target(target_env: Any, target_data: Any) -> None:
         raise ValueError("target_env and target_data exclude each other: pass the target or a log of it")
 
 
+def check_offline(passed: Collection[str]) -> None:
+    """Refuse what acts on steps in the target where a log stands in for it.
+
+    :param passed: names of the arguments that the user passed
+    :raises ValueError: naming them
+    """
+    unused = sorted(ONLINE & set(passed))
+    if unused:
+        raise ValueError(f"target_data: no step is taken in a target, so {', '.join(unused)} has no use; leave it out")
+
+
+def plain_effects(kwargs: dict[str, Any]) -> dict[str, Any]:
+    """``dynamics_kwargs`` with effects as they are kept: an :class:`~sb3_rpto.effects.Effect` may be passed, too.
+
+    :raises TypeError: for what is neither, or a single one
+    """
+    effects = kwargs.get("effects")
+    if effects is None:
+        return dict(kwargs)
+    if not isinstance(effects, list | tuple):
+        raise TypeError(f"dynamics_kwargs['effects'] must be a list of effects, not {type(effects).__name__}")
+    plain = [e.to_json() if isinstance(e, Effect) else e for e in effects]
+    for effect in plain:
+        if not isinstance(effect, Mapping):
+            raise TypeError(f"dynamics_kwargs['effects'] must hold effects or their to_json(), not {effect!r}")
+    return {**kwargs, "effects": plain}
+
+
 def list_of_names(declared: Sequence[str]) -> tuple[str, ...]:
     """``declared=`` as a tuple.
 
@@ -94,6 +127,11 @@ def check_applicable(algorithm: str, updates_dynamics: bool, passed: Collection[
     inapplicable = sorted(set() if updates_dynamics else DYNAMICS_ARGUMENTS & set(passed))
     if inapplicable:
         raise ValueError(f"{algorithm} does not use {inapplicable}; leave them out or use RPTO")
+
+
+def check_values_of(model: TwoWorlds) -> None:
+    """:func:`check_values` of what a model was given."""
+    check_values(dynamics=model.dynamics_backend, **{name: getattr(model, name) for name in CHECKED})
 
 
 def check_values(
@@ -158,6 +196,8 @@ def check_something_to_fit(
     """
     if isinstance(close_loop, str):
         raise TypeError(f"close_loop must be True or a list of kinds, not a string; write [{close_loop!r}]")
+    if close_loop is None:
+        raise TypeError("close_loop must be True, False or a list of kinds, not None; leave it out")
     for kind in [] if isinstance(close_loop, bool) else close_loop:
         if kind not in LIBRARY:
             raise ValueError(f"close_loop: no effect {kind!r} is registered; {near(kind, LIBRARY)}")
@@ -176,7 +216,7 @@ def check_something_to_fit(
                 else "or pass dynamics='physical' and close_loop=True on a MuJoCo env"
             )
         )
-    if mujoco and "rollout_start" in passed:
+    if config["backend"] == "physical" and "rollout_start" in passed:
         raise ValueError(
             "rollout_start is for one-step branches; dynamics='physical' simulates whole episodes: leave it out"
         )
@@ -266,12 +306,19 @@ def _warn_of_little(model: TwoWorlds, total_timesteps: int) -> None:
             f"{model.model_train_freq} target steps; raise it, or lower model_train_freq",
             stacklevel=4,
         )
-    elif model.loop is not None and model.loop.first_comes_after(model) > total_timesteps:
+    elif model.loop is not None and _first_trace(model, model.loop) > total_timesteps:
         warnings.warn(
             f"total_timesteps={total_timesteps} ends before the closed loop's first trace, for which it waits "
-            f"{model.loop.first_comes_after(model)} target steps; raise it",
+            f"{_first_trace(model, model.loop)} target steps, until a fit (model_train_freq={model.model_train_freq}); "
+            "raise it",
             stacklevel=4,
         )
+
+
+def _first_trace(model: TwoWorlds, loop: LoopCloser) -> int:
+    """After how many target steps the first trace is made: with enough of them, at a fit; 0 where it was."""
+    wait, done = loop.first_comes_after(model), model._since_fit
+    return max(wait, 0) and -(-(wait + done) // model.model_train_freq) * model.model_train_freq - done
 
 
 def check_callbacks(callback: BaseCallback, target_env: VecEnv | None) -> None:

@@ -83,9 +83,12 @@ class TwoWorlds(PolicySnapshots):
     _pretrained_steps: int
     target_spent: dict[str, int]
 
-    #: what rebuilds the dynamics, and the user's part of it
+    #: what rebuilds the dynamics, and the user's parts of it
     dynamics_config: dict[str, Any] | None
     dynamics_kwargs: dict[str, Any]
+    dynamics_backend: str
+    #: names of the arguments that the user passed
+    _passed: frozenset[str]
 
     _last_obs: np.ndarray | None  # the target's; observations are flat Boxes, never a Dict
     _last_original_obs: np.ndarray | None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import os
 import pathlib
@@ -14,13 +15,16 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3 import SAC
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_rpto.algorithms.arguments import check_values_of
 from sb3_rpto.algorithms.bookkeeping import STEP, RuleOfEnvironment, TwoWorlds
 from sb3_rpto.algorithms.machine import check_simulator
 from sb3_rpto.algorithms.worlds import find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
+from sb3_rpto.effects.names import near
 from sb3_rpto.envs.state import restore_state, save_state
 
 Self = TypeVar("Self", bound="Resumable")
@@ -112,6 +116,9 @@ class Resumable(TwoWorlds):
                 f"load() does not change {', '.join(fixed)}, which the saved dynamics have; begin anew by "
                 f"{cls.__name__}.from_source(...) of the source's SAC"
             )
+        for name in kwargs:
+            if name not in _arguments(cls):
+                raise ValueError(f"load() was given {name!r}, which is no argument; {near(name, _arguments(cls))}")
         model = super().load(path, gym.make(env) if isinstance(env, str) else env, *args, **kwargs)
         if model._resume_state is None:
             raise ValueError(
@@ -121,6 +128,7 @@ class Resumable(TwoWorlds):
         if (model.dynamics is not None) != cls.updates_dynamics:
             saved_by = "RPO" if model.dynamics is None else "RTO or RPTO"
             raise ValueError(f"{path} was saved by {saved_by}, {cls.__name__} cannot continue it; load it there")
+        check_values_of(model)
         model._warm = model._resume_state["warm"]
         if model._resume_state.get("learner") is not None:  # set_parameters() has dropped it
             model.snapshots["learner"] = model._resume_state["learner"]
@@ -147,6 +155,12 @@ class Resumable(TwoWorlds):
             if hasattr(self.dynamics, "optimizer"):
                 state_dicts.append("dynamics.optimizer")
         return state_dicts, variables
+
+
+def _arguments(cls: type) -> set[str]:
+    """Names that SB3's ``load`` and the constructors of a class take."""
+    functions = [SAC.load, *(vars(parent)["__init__"] for parent in cls.__mro__ if "__init__" in vars(parent))]
+    return {name for function in functions for name in inspect.signature(function).parameters}
 
 
 def _picklable(config: dict[str, Any] | None) -> dict[str, Any] | None:

@@ -74,8 +74,6 @@ class TransferAlgorithm(Looping):
         returns and HER
     """
 
-    #: names of the arguments that the user passed
-    _passed: frozenset[str]
     #: ``num_timesteps`` where the target rollout under way began
     _rollout_began_at: int
 
@@ -170,7 +168,7 @@ class TransferAlgorithm(Looping):
         )
         self.preset = preset
         self.dynamics_backend = dynamics
-        self.dynamics_kwargs = dict(dynamics_kwargs or {})
+        self.dynamics_kwargs = arguments.plain_effects(dynamics_kwargs or {})
         self.declared = arguments.list_of_names(declared)
         self.close_loop = close_loop
         #: traces what the simulator lacks, and holds the reports; None with the loop open and no log to trace on
@@ -242,8 +240,9 @@ class TransferAlgorithm(Looping):
 
     def _check_arguments(self) -> None:
         arguments.check_applicable(type(self).__name__, self.updates_dynamics, self._passed)
-        checked = {name: getattr(self, name) for name in arguments.CHECKED}
-        arguments.check_values(dynamics=self.dynamics_backend, **checked)
+        if self._offline:
+            arguments.check_offline(self._passed)
+        arguments.check_values_of(self)
 
     def _setup_model(self) -> None:
         """Build networks, buffers and dynamics from the spaces alone: ``load()`` has no environment."""

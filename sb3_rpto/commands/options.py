@@ -57,7 +57,7 @@ def device(text: str) -> str:
 
 
 def setting(text: str) -> tuple[str, Any]:
-    """``gradient_steps=5`` -> ("gradient_steps", 5); numbers such as 1e-3 are numbers.
+    """``gradient_steps=5`` -> ("gradient_steps", 5); see :func:`_read` of what YAML leaves as text.
 
     :raises argparse.ArgumentTypeError: for a text of another form
     """
@@ -70,10 +70,22 @@ def setting(text: str) -> tuple[str, Any]:
         parsed = yaml.safe_load(value)
     except yaml.YAMLError as error:
         raise argparse.ArgumentTypeError(f"{text!r}: the value is no YAML") from error
-    if isinstance(parsed, str):  # YAML 1.1 takes 1e-3 for text
+    return name, _read(parsed)
+
+
+def _read(parsed: Any) -> Any:
+    """What Python users mean by ``1e-3`` (YAML 1.1 takes it for text), ``1e6`` (a whole number) and ``None``."""
+    if isinstance(parsed, dict):
+        return {name: _read(value) for name, value in parsed.items()}
+    if isinstance(parsed, list):
+        return [_read(value) for value in parsed]
+    if parsed == "None":
+        return None
+    if isinstance(parsed, str):
         with contextlib.suppress(ValueError):
-            parsed = float(parsed)
-    return name, parsed
+            number = float(parsed)
+            return int(number) if number.is_integer() and "." not in parsed else number
+    return parsed
 
 
 def check_positive(parsed: argparse.Namespace, *names: str) -> None:

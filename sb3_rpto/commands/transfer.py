@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,7 +67,7 @@ def run(parsed: argparse.Namespace) -> int:
     """Transfer, or go on with it."""
     from sb3_rpto.algorithms.checkpoint import write_atomically
     from sb3_rpto.commands.runs import RunFolder, SavedCurve
-    from sb3_rpto.experiments.methods import REGISTRY, Run
+    from sb3_rpto.experiments.methods import REGISTRY, Run, uses_source_data
     from sb3_rpto.zoo.settings import ALGORITHMS, shipped_settings
 
     options.check_positive(parsed, "steps", "every", "episodes")
@@ -77,6 +78,8 @@ def run(parsed: argparse.Namespace) -> int:
     target = options.world(parsed.target, "TARGET")
     source = _source(parsed, target)
     settings = dict(parsed.set)
+    if parsed.source_data is not None and not uses_source_data(parsed.method, settings):
+        print(f"sb3-rpto: --method {parsed.method} has no use for --source-data", file=sys.stderr)
     _check(parsed.method, settings, parsed.source_model, target)
     budget = shipped_settings(parsed.method if parsed.method in ALGORITHMS else "rpto", target.env_id)["n_timesteps"]
     steps = parsed.steps or budget

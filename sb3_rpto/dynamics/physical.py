@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
@@ -95,6 +96,9 @@ class PhysicalDynamics(Dynamics):
         ):
             if not value >= least:
                 raise ValueError(f"{name} must be at least {least:g}, not {value!r}")
+        for name, value in (("max_steps", max_steps), ("threads", threads)):
+            if not isinstance(value, Integral) or value < 0:
+                raise ValueError(f"{name} must be an integer that is not negative, not {value!r}")
         if isinstance(model, PlainModel):
             model = model.compile()
         if action_space.shape != (model.nu,):

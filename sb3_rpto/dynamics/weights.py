@@ -37,7 +37,10 @@ def rto_weights(
     :param gamma: discount factor
     :param floor: epsilon of the paper, the smallest weight
     :return: (n,), min-max normalised over ``data``, plus ``floor``
+    :raises ValueError: there is no such weighting
     """
+    if weighting not in WEIGHTINGS:
+        raise ValueError(f"weighting={weighting!r} does not exist; choose one of {list(WEIGHTINGS)}")
     with th.no_grad():
         if weighting == "value_aware":
             predicted = dynamics.step(data.observations, data.actions, deterministic=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -78,8 +78,7 @@ def _zero_shot(run: Run, curve: LearningCurve) -> None:
 def two_worlds(cls: type[TransferAlgorithm], run: Run, curve: LearningCurve) -> None:
     """Algorithms over a source and a target, warm-started from the source model."""
     source, kwargs = make_vec_env(run.make_source, n_envs=run.n_source_envs), dict(run.kwargs)
-    if cls.updates_dynamics:
-        kwargs["source_data"] = run.source_data
+    kwargs["source_data"] = run.source_data
     model = cls.from_source(run.source_model, source, run.make_target(), seed=run.seed, device=run.device, **kwargs)
     model.learn(run.budget, callback=curve)
 
@@ -184,3 +183,14 @@ REGISTRY: dict[str, Method] = {
     "sysid-retrain": Method(_sysid_retrain, _number(0), in_batches=True),
     "oracle": Method(_sac_warm, _number(1)),
 }
+
+
+def uses_source_data(method: str, settings: Collection[str]) -> bool:
+    """Whether a method has a use for recorded transitions of the source.
+
+    :param method: its name in :data:`REGISTRY`
+    :param settings: names of the arguments that it is given
+    """
+    if method == "sac-warm-high":
+        return "n_critics" in settings
+    return method not in ("zero-shot", "sac", "sac-warm", "oracle", "sysid-retrain")

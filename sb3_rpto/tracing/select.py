@@ -287,7 +287,7 @@ class Selector:
             for drop in _bundles(order, trifles):
                 trial = self.model([e for e in current.effects if e not in drop], current.fit)
                 evidence = self.evidence(current, trial)
-                self.say(1 - len(trial.effects) / begun, f"{len(trial.effects)} effects left")
+                self.say(1 - len(trial.effects) / begun, f"{len(current.effects)} effects left, trying without some")
                 if not evidence.clear(*(self.limit(current) if limit is None else (limit, GAIN))):
                     reduced = trial
                     for e in drop:

@@ -9,8 +9,9 @@ from stable_baselines3 import PPO, TD3
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_rpto import RPO, RPTO
+from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms import arguments
 from sb3_rpto.effects import LIBRARY
 
@@ -155,6 +156,49 @@ def test_effects_that_are_known_are_trained(close_loop):
     given = {"effects": [LIBRARY["command_delay"]("slide", delay=0.03).to_json()]}
     made = physical(close_loop=close_loop, dynamics_kwargs=given)
     assert made.dynamics.names == ["command_delay(slide).delay"]
+
+
+def test_effects_need_not_be_plain_data():
+    delay = LIBRARY["command_delay"]("slide", delay=0.03)
+    made = physical(dynamics_kwargs={"effects": [delay]})
+    assert made.dynamics.names == ["command_delay(slide).delay"]
+    assert made.dynamics_kwargs["effects"] == [delay.to_json()]
+
+
+@pytest.mark.parametrize(
+    ("error", "kwargs", "said"),
+    [
+        (TypeError, {"dynamics_kwargs": {"effects": LIBRARY["command_delay"]("slide", delay=0.03)}}, "a list of effe"),
+        (TypeError, {"dynamics_kwargs": {"effects": ["command_delay"]}}, r"effects or their to_json\(\), not 'comm"),
+        (ValueError, {"dynamics_kwargs": {"max_steps": 2.5}}, "max_steps must be an integer"),
+        (ValueError, {"dynamics_kwargs": {"threads": -1}}, "threads must be an integer that is not negative"),
+        (TypeError, {"close_loop": None}, "close_loop must be True, False or a list"),
+    ],
+)
+def test_wrong_settings_of_a_simulator_are_refused_at_once(error, kwargs, said):
+    with pytest.raises(error, match=said):
+        physical(**{"declared": ["hinge.damping"], "dynamics_kwargs": {}, **kwargs})
+
+
+def test_what_acts_on_target_steps_has_no_use_for_a_log():
+    log = small(RPO).learn(30, source_timesteps=0).replay_buffer
+    with pytest.raises(ValueError, match="action_noise, train_freq has no use"):
+        RTO("MlpPolicy", pendulum(), target_data=log, train_freq=2, action_noise=NormalActionNoise(0.0, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "said"),
+    [
+        ({"weighting": "value-aware"}, "weighting='value-aware' does not exist"),
+        ({"source_steps": 0}, "source_steps must be a positive integer"),
+        ({"gradient_stps": 5}, "'gradient_stps', which is no argument; did you mean 'gradient_steps'"),
+    ],
+)
+def test_what_load_changes_is_looked_at_as_well(kwargs, said, tmp_path):
+    small(RPTO).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=said):
+        RPTO.load(tmp_path / "model", **kwargs)
+    assert RPTO.load(tmp_path / "model", gradient_steps=3, weighting="centred", device="cpu").gradient_steps == 3
 
 
 @pytest.mark.parametrize(

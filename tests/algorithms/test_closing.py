@@ -1008,6 +1008,15 @@ def test_a_budget_that_ends_before_the_first_trace_is_told(monkeypatch: pytest.M
         arguments.check_ready(made, 20, None)
 
 
+def test_the_first_trace_waits_for_a_fit() -> None:
+    made = model([], model_train_freq=150)
+    with pytest.warns(UserWarning, match="for which it waits 300 target steps"):
+        arguments.check_ready(made, 290, None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        arguments.check_ready(made, 300, None)
+
+
 def test_what_is_owed_is_owed_to_a_run_that_counts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     made = judged(monkeypatch)
     made.learn(20, reset_num_timesteps=False, callback=lambda *_: made._owed < 10)

@@ -16,7 +16,7 @@ from stable_baselines3.common.save_util import load_from_pkl
 
 from sb3_rpto import RPO, RPTO, cli
 from sb3_rpto.algorithms.slbo import SLBO
-from sb3_rpto.commands import video
+from sb3_rpto.commands import options, video
 from sb3_rpto.commands.plot import read_rows
 from sb3_rpto.commands.policies import load_policy
 from sb3_rpto.commands.runs import RunFolder, SavedCurve
@@ -312,6 +312,33 @@ def test_wrong_input_is_one_line_before_the_work(
 def test_a_corrected_command_may_use_the_folder(agent: Path, tmp_path: Path) -> None:
     assert transfer(agent, tmp_path, "rpto", "--set", "weighting=papre") == 2
     assert transfer(agent, tmp_path, "rpto", "--set", "weighting=centred") == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        *(("1e-3", 0.001), ("1e1", 10), ("1.0", 1.0), ("None", None), ("[1e-3, auto]", [0.001, "auto"])),
+        *(("{learning_rate: 1e-3, hidden: [2e2]}", {"learning_rate": 0.001, "hidden": [200]}), ("inf", float("inf"))),
+    ],
+)
+def test_values_of_settings_are_what_python_users_mean(text: str, value: object) -> None:
+    assert options.setting(f"name={text}") == ("name", value)
+    assert type(options.setting(f"name={text}")[1]) is type(value)
+
+
+def test_source_transitions_are_for_methods_with_a_use_for_them(
+    agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert transfer(agent, tmp_path / "warm", "zero-shot") == 0
+    assert "--method zero-shot has no use for --source-data" in capsys.readouterr().err
+    assert transfer(agent, tmp_path / "rpo", "rpo") == 0
+    assert "no use" not in capsys.readouterr().err
+    assert rows(tmp_path / "rpo")[0]["source_steps"] == 0
+
+
+def test_a_traceback_is_there_for_those_who_ask(agent: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="does not exist"):
+        cli.main(["--traceback", "transfer", str(agent / "model.zip"), TARGET, "--method", "rtpo", "--out", "x"])
 
 
 def test_numbers_in_settings_are_numbers(agent: Path, tmp_path: Path) -> None:
