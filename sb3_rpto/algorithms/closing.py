@@ -14,6 +14,7 @@ from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.base import Transitions
+from sb3_rpto.dynamics.onestep import remembered
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Declared, from_json
 from sb3_rpto.envs.observations import single_env
@@ -390,8 +391,14 @@ def _from_resets(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
 
 
 def outdated(model: Looping, dynamics: PhysicalDynamics) -> bool:
-    """Whether D_source holds what another simulator than the present one produced."""
-    return dynamics.error(model.transitions("source").take(slice(OLDEST))) > OTHER
+    """Whether D_source holds what another simulator than the present one produced.
+
+    Where the oldest transitions were overwritten, the next ones have lost the commands that late motors still act on.
+    """
+    side, lead = model.replay_buffer.source, 0
+    if side.full:
+        lead = min(remembered(dynamics.model, dynamics.frame_skip) * int(model.source_steps), side.size() // 2)
+    return dynamics.error(model.transitions("source").take(slice(lead + OLDEST)), lead=lead) > OTHER
 
 
 def renew_source(model: Looping) -> None:

@@ -88,7 +88,7 @@ def as_steps(
     :param frame_skip: simulation steps in one transition
     :param chosen: ascending rows that become steps, of the others only the commands count; None: all
     """
-    earlier = -(-round(MEMORY / float(model.opt.timestep)) // frame_skip)
+    earlier = remembered(model, frame_skip)
     chosen = np.arange(len(data)) if chosen is None else chosen
     arrays = (data.observations, data.next_observations, data.actions)
     observations, next_observations, actions = (a.cpu().numpy().astype(np.float64) for a in arrays)
@@ -110,6 +110,11 @@ def as_steps(
     qpos, qvel = np.split(begun, [model.nq], axis=1)
     scale = np.where(ever & (spread > 1e-8), np.maximum(spread, 1e-8), np.inf)
     return Steps(rows, qpos, qvel, Drive(drive, earlier * frame_skip), reached, scale)
+
+
+def remembered(model: mujoco.MjModel, frame_skip: int) -> int:
+    """Transitions before one whose commands may still act in it."""
+    return -(-round(MEMORY / float(model.opt.timestep)) // frame_skip)
 
 
 def _known_at_rest(recover: StateMap) -> np.ndarray:

@@ -274,9 +274,13 @@ class PhysicalDynamics(Dynamics):
             th.as_tensor(ends, device=device),
         )
 
-    def error(self, data: Transitions) -> float:
-        """As in :class:`~sb3_rpto.dynamics.base.Dynamics`, of positions and velocities in place of observations."""
-        steps = self._steps(data)
+    def error(self, data: Transitions, lead: int = 0) -> float:
+        """As in :class:`~sb3_rpto.dynamics.base.Dynamics`, of positions and velocities in place of observations.
+
+        :param data: transitions, oldest first
+        :param lead: of so many of the oldest only the commands count
+        """
+        steps = self._steps(data, np.arange(lead, len(data)))
         shown = steps.compared
         if not len(steps) or not shown.any():
             return float("nan")

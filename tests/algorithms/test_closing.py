@@ -352,6 +352,19 @@ def test_renewed_data_are_the_simulators_own_where_commands_are_late() -> None:
     assert not outdated(made, dynamics(made))
 
 
+def test_data_that_have_lost_their_past_are_not_another_simulators() -> None:
+    late = LIBRARY["command_delay"]("slide", delay=0.05).to_json()
+    made = model([], dynamics_kwargs={"effects": [late]}, buffer_size=200)
+    made.learn(1, source_timesteps=0)
+    assert made._source_world is not None
+    made._source_world.interact(made, 303)
+    assert made.replay_buffer.source.full
+    assert dynamics(made).error(made.transitions("source")) > closing.OTHER  # the oldest commands are gone
+    assert not outdated(made, dynamics(made))
+    dynamics(made).adopt([LIBRARY["coulomb_friction"]("slider", level=50.0)])
+    assert outdated(made, dynamics(made))
+
+
 def test_an_unstable_correction_is_refused(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     made = filled(friction())
     before = dynamics(made).describe()
