@@ -5,7 +5,7 @@ import numpy as np
 
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.inertia import from_tensor, rotations, spread, to_tensor
-from sb3_rpto.effects.length import link_length, write_length
+from sb3_rpto.effects.length import held_by_constraint, link_length, write_length
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.world import World
 
@@ -85,16 +85,20 @@ class LinkLength(Effect):
 
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
-        """Moving bodies that have a capsule."""
-        names = object_names(model, "body")
-        return [name for name in super().places(model) if link_length(model, names.index(name)) > 0]
+        """Moving bodies that have a capsule and that no connect or weld names."""
+        ids = {name: i for i, name in enumerate(object_names(model, "body"))}
+        have = [name for name in super().places(model) if link_length(model, ids[name]) > 0]
+        return [name for name in have if not held_by_constraint(model, ids[name])]
 
     def bind(self, model: mujoco.MjModel) -> None:
         """As in :class:`Effect`.
 
-        :raises ValueError: the body has no capsule
+        :raises ValueError: the body has no capsule, or a connect or weld names it
         """
         super().bind(model)
+        held = held_by_constraint(model, self.index)
+        if held:
+            raise ValueError(f"link_length cannot sit on {self.on!r}: {held} names the body; tie it by sites (site1=)")
         self.nominal = link_length(model, self.index)
         if self.nominal == 0:
             raise ValueError(f"link_length cannot sit on {self.on!r}: the body has no capsule to stretch")

@@ -19,7 +19,7 @@ import numpy as np
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import LIBRARY, Effect, from_json
 from sb3_rpto.effects.mjcf import restore, rounded, write_mjcf
-from sb3_rpto.effects.model import ModelSource, load_model
+from sb3_rpto.effects.model import ModelSource, alike, load_model
 from sb3_rpto.effects.names import near
 from sb3_rpto.effects.simulation import Simulation, prepare
 from sb3_rpto.effects.units import units_at
@@ -50,12 +50,15 @@ class Corrected:
         return Simulation(self.model, [e for e in self.effects if carried_by(e) == "wrapper"], nthread)
 
     def apply(self, env: gym.Env) -> CorrectedEnv:
-        """Put all effects into ``env``, which must have the nominal model.
+        """Put all effects into ``env``, which has the nominal model; one that has :attr:`model` lacks the others alone.
 
         :param env: a gymnasium MuJoCo environment; it is changed. :func:`sb3_rpto.envs.corrected.apply_effects` with
             :attr:`effects` leaves it alone
         """
-        return CorrectedEnv(env, self.effects)
+        effects = self.effects
+        if alike(env.unwrapped.model, self.model):  # type: ignore[attr-defined]
+            effects = [e for e in effects if carried_by(e) == "wrapper"]
+        return CorrectedEnv(env, effects)
 
 
 def carried_by(effect: Effect) -> Literal["mjcf", "wrapper"]:

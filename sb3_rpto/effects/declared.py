@@ -11,7 +11,7 @@ import numpy as np
 
 from sb3_rpto.effects.actuation import LAGS
 from sb3_rpto.effects.effect import Effect, Parameter, Scales
-from sb3_rpto.effects.length import link_length, write_length
+from sb3_rpto.effects.length import held_by_constraint, link_length, write_length
 from sb3_rpto.effects.names import SCALAR_JOINTS, near, object_id, object_names
 from sb3_rpto.effects.world import World
 
@@ -120,6 +120,23 @@ def _write_strength(world: World, actuator: int, values: np.ndarray, nominal: fl
         world.field(name)[:, actuator] *= values[:, None]
 
 
+def _read_length(model: mujoco.MjModel, body: int) -> float:
+    held = held_by_constraint(model, body)
+    if held:
+        raise ValueError(f"{held} names the body, and its anchor would not move with the link; tie it by sites")
+    return link_length(model, body)
+
+
+def _read_gear(model: mujoco.MjModel, actuator: int) -> float:
+    """The largest entry: of a joint's or tendon's transmission the first, of a thruster's that of its axis."""
+    gear = model.actuator_gear[actuator]
+    return float(gear[np.argmax(np.abs(gear))])
+
+
+def _write_gear(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
+    world.field("actuator_gear")[:, actuator] = np.outer(values / nominal, world.model.actuator_gear[actuator])
+
+
 def _range(model: mujoco.MjModel, joint: int) -> float:
     low, high = model.jnt_range[joint]
     return float(high - low) if model.jnt_limited[joint] else 0.0
@@ -157,11 +174,11 @@ _KINDS: dict[str, dict[str, _Kind]] = {
     "body": {
         "mass": _Kind("kg", *_column("body_mass")[:1], _write_mass, lambda s: 0.05 * s.mass, _POSITIVE),
         "inertia": _Kind("kg·m²", *_column("body_inertia", 0)[:1], _write_inertia, lambda s: s.inertia, (0.03, 30.0)),
-        "length": _Kind("m", link_length, write_length, lambda s: 0.1, (0.5, 2.0)),
+        "length": _Kind("m", _read_length, write_length, lambda s: 0.1, (0.5, 2.0)),
     },
     "geom": {"friction": _Kind("", *_column("geom_friction", 0), lambda s: 0.1)},
     "actuator": {
-        "gear": _Kind("", *_column("actuator_gear", 0), lambda s: 1.0, _POSITIVE),
+        "gear": _Kind("", _read_gear, _write_gear, lambda s: 1.0, _POSITIVE),
         "gain": _Kind("", *_column("actuator_gainprm", 0), lambda s: 1.0, _POSITIVE),
         "kp": _Kind("N·m/rad", _read_kp, _write_kp, lambda s: 1.0, _POSITIVE),
         "kv": _Kind("N·m·s/rad", _read_kv, _write_kv, _viscous_size),
@@ -239,7 +256,7 @@ class Declared(Effect):
             raise ValueError(f"{name}: {error}") from None
         if how.span is not None and nominal == 0:
             raise ValueError(f"{name} is 0 in the model, so it cannot be scaled; give it a value in the MJCF")
-        lower, upper = bounds or ((0.0, np.inf) if how.span is None else tuple(nominal * s for s in how.span))
+        lower, upper = bounds or ((0.0, np.inf) if how.span is None else tuple(sorted(nominal * s for s in how.span)))
         if not lower <= nominal <= upper or lower == upper:
             raise ValueError(f"{name}: the bounds [{lower:g}, {upper:g}] do not hold the nominal value {nominal:g}")
         self._take(name, nominal, lower, upper)
@@ -280,8 +297,8 @@ class Declared(Effect):
 
     @property
     def rank(self) -> int:
-        """Its turn among declared parameters: what changes a mass or an inertia besides comes before these."""
-        return {"mass": 1, "inertia": 2}.get(self.label.rpartition(".")[2], 0)
+        """Its turn among declared parameters: factors come after what they multiply."""
+        return {"mass": 1, "inertia": 2, "strength": 3}.get(self.label.rpartition(".")[2], 0)
 
     def __repr__(self) -> str:
         return f"{self.label} = {self.values[0]:.4g} {self.parameters[0].unit}".rstrip()

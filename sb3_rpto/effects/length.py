@@ -18,6 +18,8 @@ from sb3_rpto.effects.inertia import from_tensor, matrices, to_tensor
 from sb3_rpto.effects.world import World
 
 _CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+_BODY = int(mujoco.mjtObj.mjOBJ_BODY)
+_ANCHORED = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 _TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
 _VOLUMES = {
     _CAPSULE: lambda s: np.pi * s[:, 0] ** 2 * (2 * s[:, 1] + 4 / 3 * s[:, 0]),
@@ -31,6 +33,18 @@ _VOLUMES = {
 def link_length(model: mujoco.MjModel, body: int) -> float:
     """Length in m of the longest capsule of a body, between the centres of its caps; 0 without a capsule."""
     return max((2 * float(model.geom_size[g, 1]) for g in _capsules(model, body)), default=0.0)
+
+
+def held_by_constraint(model: mujoco.MjModel, body: int) -> str:
+    """Name of a connect or weld that names the body, whose anchors in it would not be stretched; empty: there is none.
+
+    Those between sites are: sites are stretched with their link.
+    """
+    for i in range(model.neq):
+        named = model.eq_objtype[i] == _BODY and body in (model.eq_obj1id[i], model.eq_obj2id[i])
+        if named and model.eq_type[i] in _ANCHORED:
+            return model.equality(i).name or f"equality {i}"
+    return ""
 
 
 def write_length(world: World, body: int, values: np.ndarray, nominal: float) -> None:

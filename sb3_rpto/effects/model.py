@@ -114,6 +114,16 @@ def differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
     return [n for n in mine if n not in derived and not np.array_equal(mine[n], theirs[n], equal_nan=True)]
 
 
+def alike(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:
+    """Whether two compiled models have the same numbers, but for the digits that an MJCF rounds off."""
+    derived = set(mujoco.MjModel._setconst_outputs) - set(mujoco.MjModel._setconst_inputs)
+    mine, theirs = numbers(one), numbers(other)
+    if {n: v.shape for n, v in mine.items()} != {n: v.shape for n, v in theirs.items()}:
+        return False
+    compared = [n for n in mine if n not in derived and not n.startswith("stat.")]  # of a model as it was compiled
+    return all(np.allclose(mine[n], theirs[n], 1e-4, 1e-9, equal_nan=True) for n in compared)
+
+
 def _public(owner: Any) -> Iterator[tuple[str, Any]]:
     return ((name, getattr(owner, name)) for name in dir(owner) if not name.startswith("_"))
 

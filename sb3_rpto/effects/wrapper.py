@@ -182,7 +182,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             if effect.place == "joint":
                 world.rough(effect.dof)
         world.settle()
-        command, dt = np.array(ctrl, dtype=float), model.opt.timestep
+        command, dt, others = np.array(ctrl, dtype=float), model.opt.timestep, data.qfrc_applied.copy()
         kept = math.ceil(max(layer._latest() for layer in stack) / dt) + 1
         if kept > 1 and not self._past:
             self._past = [(data.qpos.copy(), data.qvel.copy())]
@@ -193,13 +193,14 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             data.ctrl[:] = sent
             if acting:
                 push(world, acting)
+                data.qfrc_applied += others
             mujoco.mj_step(model, data)
             if kept > 1:
                 self._past = [*self._past[1 - kept :], (data.qpos.copy(), data.qvel.copy())]
         if acting:
             # What a later set_state computes must not depend on the substep before it.
             world.restore()
-            data.qfrc_applied[:] = 0
+            data.qfrc_applied[:] = others
         mujoco.mj_rnePostConstraint(model, data)
 
     def _observe(self, *args: Any, **kwargs: Any) -> Any:

@@ -14,6 +14,8 @@ GAP = 5.0
 """A step in time longer than this many median steps is a gap."""
 JITTER = 0.05
 """Time is called jittered when 5 % of the steps are off the median by more than this fraction of it."""
+FEWEST_READINGS, FEWEST_STEPS = 20, 5
+"""Readings that tell whether positions are held between them; different changes that no coarse encoder makes."""
 SLOPE = (0.8, 1.25)
 """Slopes of measured velocity against the position's change that pass for one."""
 SPAN = 16
@@ -147,6 +149,22 @@ def rounding(position: np.ndarray) -> float | None:
         return 0.0
     steps = np.diff(levels)
     return float(steps[steps > 1e-9 * np.ptp(levels)].min())  # levels that differ by float's rounding are one
+
+
+def held(positions: np.ndarray) -> int | None:
+    """Rows per fresh reading, where all positions are repeated between readings, (n, m); None where they are not.
+
+    A coarse encoder repeats itself too, but changes by one step, and when the motion says so.
+    """
+    steps = np.diff(positions, axis=0)
+    fresh = np.flatnonzero(np.any(steps != 0, axis=1))
+    if len(fresh) < FEWEST_READINGS:
+        return None
+    gaps = np.diff(fresh)
+    usual = int(np.median(gaps))
+    low, high = np.quantile(gaps, (0.1, 0.9))
+    moved = max(len(np.unique(np.abs(steps[fresh, i]).round(12))) for i in range(positions.shape[1]))
+    return usual if usual >= 2 and low >= 2 and high <= 1.5 * usual and moved > FEWEST_STEPS else None
 
 
 def velocity_slope(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> float | None:

@@ -17,6 +17,8 @@ OTHER_UNIT = 100.0
 DEGREES = 180 / np.pi
 #: Times in s should be told as finely as this.
 FINEST = 1e-10
+#: Norms of quaternions may be off by so much.
+UNIT = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +206,21 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
             "jitter",
             f"steps vary by {spread:.0%} around their median of {np.median(np.diff(time)):.4g} s; kept as they are",
         )
+    rows = checks.held(episode.qpos)
+    if rows is not None:
+        say(
+            "held samples",
+            f"positions are fresh in every {rows}. row alone, and repeated between: keep those rows, as held ones look "
+            "like late sensors and commands",
+            "qpos",
+        )
     for joint, first in _quaternions(columns):
+        norms = np.linalg.norm(episode.qpos[:, first : first + 4], axis=1)
+        if np.nanmax(np.abs(norms - 1), initial=0.0) > UNIT:
+            raise ValueError(
+                f"{episode.name}: qpos.{joint} holds no unit quaternion in its last four columns (norms from "
+                f"{np.nanmin(norms):.3g} to {np.nanmax(norms):.3g}); give w, x, y, z in this order"
+            )
         flips = checks.align_quaternions(episode.qpos[:, first : first + 4])
         if flips:
             say("quaternion sign", f"{flips} change(s) between q and -q, one orientation; aligned", f"qpos.{joint}")

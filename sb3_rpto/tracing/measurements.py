@@ -4,6 +4,7 @@ import csv
 import glob
 import gzip
 import os
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -232,10 +233,17 @@ class Measurements:
         """All samples as one table of columns of shape (sum of T,), in the file format and its units, for any writer.
 
         Repairs are in it: unwrapped angles, estimated velocities, one episode for each stretch between gaps (and one
-        run, when read again).
+        run, when read again). A table does not say whether data are exact, what was not observed, known noise, nor
+        which samples are not usable; where there is such a thing, a warning says so.
 
         :raises ValueError: there are no episodes
         """
+        lost = [name for name in ("exact", "simulated", "unobserved") if getattr(self, name)]
+        lost += ["noise"] if self.noise is not None else []
+        lost += [] if all(e.usable.all() for e in self.episodes) else ["usable"]
+        if lost:
+            message = f"a table does not hold {', '.join(lost)} of these recordings: read again, they count as measured"
+            warnings.warn(message, stacklevel=2)
 
         def join(arrays: Iterable[Any]) -> np.ndarray:
             return np.concatenate(list(arrays))

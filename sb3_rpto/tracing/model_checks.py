@@ -26,7 +26,7 @@ LONGEST_STEP = 0.5
 """Samples farther apart than this, in s, are taken for times in another unit."""
 SHORTEST_STEP = 0.01
 """Samples nearer to each other than this share of the model's step are taken for times in another unit."""
-TURNS = 6
+TURNS = 2
 """Hinges that move over more turns than this are said to: the angles may be in degrees."""
 SOFT = 0.005
 """Dry friction with a longer time constant than this, in s, creeps by more than the noise (MuJoCo's default: 0.02)."""

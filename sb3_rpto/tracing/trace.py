@@ -121,6 +121,11 @@ def trace(
 
     say(0.9, "predicting the test runs")
     data = set_up.test if set_up.test.episodes else fitted
+    errors_after = horizon_errors(simulation, final, data, sigma, seed)
+    if not errors_after:
+        length = 1e3 * max((float(np.ptp(e.time)) for e in data.episodes), default=0.0)
+        message = f"no error on unseen runs: the longest stretch of theirs has {length:.3g} ms; set longer runs apart"
+        findings.append(Finding("split", "test runs", message))
     # What an equality constraint transmits is not known from the motion.
     tied = simulation.model.neq > 0
     residuals_before = [] if tied else force_residuals(simulation, before.values, data)
@@ -143,7 +148,7 @@ def trace(
         adequacy_before=found.before,
         adequacy_after=found.after,
         before=horizon_errors(simulation, before.values, data, sigma, seed),
-        after=horizon_errors(simulation, final, data, sigma, seed),
+        after=errors_after,
         floor=noise_floor(simulation, final, data, sigma, seed),
         force_before=summary(residuals_before) if residuals_before else unknown,
         force_after=summary(residuals_after) if residuals_after else unknown,

@@ -421,3 +421,17 @@ def test_bad_sources_are_named(tmp_path):
         load_model(gym.make("Pendulum-v1"))
     with pytest.raises(ValueError, match="nothing tells the MJCF of this MjModel"):
         save_corrected(tmp_path, mujoco.MjModel.from_xml_string(PLAIN), [])
+
+
+def test_effects_that_the_loaded_model_has_already_are_not_put_in_twice(tmp_path):
+    effects = [LIBRARY["coulomb_friction"]("hinge", level=0.5), LIBRARY["payload"]("pole", mass=1.0)]
+    effects.append(LIBRARY["command_delay"]("slide", delay=0.04))
+    env = gym.make("InvertedPendulum-v5")
+    save_corrected(tmp_path, env, effects)
+    again = gym.make("InvertedPendulum-v5", xml_file=str(tmp_path / "model.xml"))
+    trajectories = []
+    for start in (env, again):
+        corrected = load_corrected(tmp_path).apply(start)
+        corrected.reset(seed=0)
+        trajectories.append([corrected.step(np.array([0.3]))[0] for _ in range(5)])
+    np.testing.assert_allclose(*trajectories, rtol=1e-4, atol=1e-6)

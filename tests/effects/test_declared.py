@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_rpto.effects import Declared, Scales, declare, parameter_names
+from sb3_rpto.effects.carry import correct
 from sb3_rpto.effects.world import BatchWorld, LiveWorld, World
 
 MODEL = mujoco.MjModel.from_xml_string("""
@@ -249,3 +250,22 @@ def test_it_pickles(name: str) -> None:
         effect.write(world, effect.values[None])
     for field in ("dof_damping", "body_mass", "opt.gravity", "jnt_stiffness"):
         np.testing.assert_array_equal(worlds[0].field(field), worlds[1].field(field))
+
+
+@pytest.mark.parametrize("names", [["motor.strength", "motor.gain"], ["motor.gain", "motor.strength"]])
+def test_a_factor_comes_after_what_it_multiplies_in_any_order(names: list[str]) -> None:
+    values = {"motor.strength": 2.0, "motor.gain": 1.5}
+    model = correct(MODEL, [d.with_values(np.array([values[d.label]])) for d in declare(MODEL, names)])
+    assert model.actuator_gainprm[0, 0] == 3.0
+
+
+def test_gears_may_be_negative_or_along_another_axis() -> None:
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size=".1"/><site name="tail"/></body></worldbody>
+    <actuator><motor name="motor" joint="hinge" gear="-2"/><general name="rotor" site="tail" gear="0 0 1 0 0 -.02"/>
+    </actuator></mujoco>""")
+    motor, rotor = declare(model, ["*.gear"])
+    assert (motor.nominal, motor.parameters[0].lower, motor.parameters[0].upper) == (-2.0, -20.0, -0.2)
+    corrected = correct(model, [motor.with_values(np.array([-3.0])), rotor.with_values(np.array([1.5]))])
+    assert corrected.actuator_gear[0, 0] == -3.0
+    np.testing.assert_allclose(corrected.actuator_gear[1], [0, 0, 1.5, 0, 0, -0.03])

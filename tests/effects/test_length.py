@@ -201,3 +201,29 @@ def test_drag_does_not_jump_with_the_length() -> None:
         mujoco.mj_forward(stretched, data)
         accelerations.append(data.qacc.copy())
     np.testing.assert_allclose(accelerations[1:], accelerations[:1] * 2, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("ends", "refused"),
+    [
+        ('body1="left" body2="right" anchor="0 0 -.5"', True),
+        ('site1="end of left" site2="end of right"', False),
+    ],
+)
+def test_a_link_that_a_constraint_holds_by_its_body_is_refused(ends: str, refused: bool) -> None:
+    link = (
+        '<body name="{0}" pos="{1} 0 0"><joint name="{0}" axis="0 1 0"/>'
+        '<geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5"/><site name="end of {0}" pos="0 0 -.5"/></body>'
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody>{link.format('left', 0)}{link.format('right', 0.1)}</worldbody>"
+        f'<equality><connect name="pin" {ends}/></equality></mujoco>'
+    )
+    assert LIBRARY["link_length"].places(model) == ([] if refused else ["left", "right"])
+    if not refused:
+        assert Declared(model, "left.length").nominal == pytest.approx(0.5)
+        return
+    with pytest.raises(ValueError, match=r"left\.length: pin names the body.*by sites"):
+        Declared(model, "left.length")
+    with pytest.raises(ValueError, match="pin names the body"):
+        LIBRARY["link_length"]("left").bind(model)

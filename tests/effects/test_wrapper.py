@@ -523,3 +523,37 @@ def test_it_is_a_gymnasium_environment_and_trains():
     agent = SAC("MlpPolicy", wrapped, learning_starts=10, batch_size=16, policy_kwargs={"net_arch": [16]}, seed=0)
     agent.learn(50)
     assert agent.num_timesteps == 50
+
+
+class Pushed(MujocoEnv):
+    """A cart-pole whose environment applies a force of its own."""
+
+    metadata = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"], "render_fps": 50}  # noqa: RUF012
+
+    def __init__(self):
+        super().__init__("inverted_pendulum.xml", 1, gym.spaces.Box(-np.inf, np.inf, (4,)))
+
+    def step(self, action):
+        self.data.qfrc_applied[0] = 3.0
+        self.do_simulation(action, self.frame_skip)
+        return self._get_obs(), 0.0, False, False, {}
+
+    def reset_model(self):
+        self.set_state(self.init_qpos, self.init_qvel)
+        return self._get_obs()
+
+    def _get_obs(self):
+        return np.concatenate([self.data.qpos, self.data.qvel])
+
+
+def test_forces_of_the_environments_own_stay():
+    offset = LIBRARY["torque_offset"]("slider", offset=2.0)
+    plain, corrected = Pushed(), CorrectedEnv(Pushed(), [offset])
+    plain.reset(seed=0)
+    corrected.reset(seed=0)
+    for _ in range(10):
+        plain.data.qfrc_applied[0] = 5.0
+        plain.do_simulation(np.zeros(1), 1)
+        seen = corrected.step(np.zeros(1))[0]
+    np.testing.assert_allclose(seen, plain._get_obs(), rtol=1e-12)
+    assert corrected.unwrapped.data.qfrc_applied[0] == 3.0

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_rpto.experiments.planting import generate
-from sb3_rpto.tracing import Measurements
+from sb3_rpto.tracing import Measurements, checks
 from sb3_rpto.tracing.checks import SLOPE, grouped, quantum, smoothed_velocity, split_at_gaps, unwrap, velocity_slope
 from sb3_rpto.tracing.columns import read_columns
 
@@ -472,3 +472,26 @@ def test_a_table_in_the_place_of_tables_is_refused(tables):
 def test_another_mark_than_a_dot_is_seen(name):
     with pytest.raises(ValueError, match=r"did you mean 'qpos\.hinge'"):
         Measurements.from_tables({"run": {"time": np.arange(9.0), name: np.arange(9.0)}})
+
+
+def test_held_samples_are_told_and_coarse_encoders_are_not() -> None:
+    time = np.arange(0, 4, 0.001)
+    motion = np.sin(3 * time) + 0.3 * np.cos(7 * time) + 1e-3 * np.random.default_rng(0).standard_normal(len(time))
+    held = motion[np.arange(len(time)) // 10 * 10]
+    for position, found in (
+        (motion, None),
+        (held, 10),
+        (np.round(np.sin(3 * time), 2), None),
+        (0.01 * time // 1e-4, None),
+    ):
+        assert checks.held(position[:, None]) == found
+    table = {"time": time, "qpos.hinge": held, "ctrl.motor": np.cos(time)}
+    assert "held samples" in kinds(Measurements.from_tables({"a": table}))
+
+
+def test_what_is_no_quaternion_is_refused() -> None:
+    time = np.arange(50) * 0.01
+    still = dict.fromkeys([f"qvel.ball.{i}" for i in range(3)], np.zeros(50))
+    degrees = {f"qpos.ball.{i}": np.full(50, 30.0 * i) for i in range(4)}
+    with pytest.raises(ValueError, match=r"qpos\.ball holds no unit quaternion.*give w, x, y, z"):
+        Measurements.from_tables({"a": {"time": time, **degrees, **still}})
