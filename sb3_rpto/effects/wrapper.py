@@ -219,11 +219,14 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         for effect, x in sensing:
             q, v = effect.observe(np.array([data.qpos[effect.adr]]), np.array([data.qvel[effect.dof]]), x)
             data.qpos[effect.adr], data.qvel[effect.dof] = q[0], v[0]
+        readings = data.sensordata.copy()
+        if sensing and base.model.nsensor:
+            data.sensordata += _errors(base.model, data, qpos, qvel)
         try:
             # A copy: observations may be views of the state.
             return copy.deepcopy(type(base)._get_obs(base, *args, **kwargs))
         finally:
-            data.qpos[:], data.qvel[:] = qpos, qvel
+            data.qpos[:], data.qvel[:], data.sensordata[:] = qpos, qvel, readings
 
     def _latest(self) -> float:
         """The longest delay of these effects' sensors in s."""
@@ -250,6 +253,20 @@ def corrections(env: gym.Env) -> list[CorrectedEnv]:
             found.append(env)
         env = env.env
     return found
+
+
+def _errors(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    """What the model's own sensors of positions and velocities show more in the state of ``data`` than in another."""
+    scratch, shown = mujoco.MjData(model), []
+    mujoco.mj_copyData(scratch, model, data)
+    for q, v in ((data.qpos, data.qvel), (qpos, qvel)):
+        scratch.qpos[:], scratch.qvel[:] = q, v
+        mujoco.mj_fwdPosition(model, scratch)
+        mujoco.mj_sensorPos(model, scratch)
+        mujoco.mj_fwdVelocity(model, scratch)
+        mujoco.mj_sensorVel(model, scratch)
+        shown.append(scratch.sensordata.copy())
+    return shown[0] - shown[1]
 
 
 def beyond_model(env: gym.Env) -> list[str]:

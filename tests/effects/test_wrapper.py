@@ -557,3 +557,36 @@ def test_forces_of_the_environments_own_stay():
         seen = corrected.step(np.zeros(1))[0]
     np.testing.assert_allclose(seen, plain._get_obs(), rtol=1e-12)
     assert corrected.unwrapped.data.qfrc_applied[0] == 3.0
+
+
+SENSED = """
+<mujoco><option timestep="0.02"/><worldbody><body><joint name="hinge" axis="0 1 0"/><geom type="capsule" size=".02"
+fromto="0 0 0 0 0 -.5"/></body></worldbody><actuator><motor name="motor" joint="hinge"/></actuator>
+<sensor><jointpos joint="hinge"/><jointvel joint="hinge"/></sensor></mujoco>"""
+
+
+class Sensed(Pushed):
+    """A pendulum that is observed by the sensors of its model."""
+
+    def __init__(self, path):
+        MujocoEnv.__init__(self, path, 1, gym.spaces.Box(-np.inf, np.inf, (2,)))
+
+    def step(self, action):
+        self.do_simulation(action, self.frame_skip)
+        return self._get_obs(), 0.0, False, False, {}
+
+    def _get_obs(self):
+        return self.data.sensordata.copy()
+
+
+def test_the_models_own_sensors_err_as_well(tmp_path):
+    (tmp_path / "model.xml").write_text(SENSED)
+    true = Sensed(str(tmp_path / "model.xml"))
+    biased = CorrectedEnv(Sensed(str(tmp_path / "model.xml")), [LIBRARY["sensor_bias"]("hinge", offset=0.3)])
+    true.reset(seed=0)
+    biased.reset(seed=0)
+    for _ in range(5):
+        seen, expected = biased.step(np.ones(1))[0], true.step(np.ones(1))[0]
+        np.testing.assert_allclose(seen, np.array([0.3, 0.0]) + expected, atol=1e-12)
+    np.testing.assert_array_equal(biased.unwrapped.data.qpos, true.data.qpos)
+    np.testing.assert_array_equal(biased.unwrapped.data.sensordata, true.data.sensordata)
