@@ -20,6 +20,7 @@ from sb3_rpto.effects import Declared, from_json
 from sb3_rpto.envs.observations import single_env
 from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.tracing.contacts import OFTEN, contact_changes
 from sb3_rpto.tracing.report import Traced
 from sb3_rpto.tracing.trace import SETTLED
 
@@ -37,8 +38,8 @@ ROUNDING = 1e-6
 MORE = 2
 #: Samples in a window: several steps show what acts late, and contacts do not amplify errors yet.
 WINDOW = 4
-#: What is missing grows with the square of the time, noise does not: where there is some, windows may have so many,
-#: as long as three of four stretches of known states hold them.
+#: What is missing grows with the square of the time, noise does not: where there is some and no contacts come and go,
+#: windows may have so many, as long as three of four stretches of known states hold them.
 NOISY_WINDOW, SHORT_STRETCHES = 6, 0.25
 #: So many transitions fill all windows of a trace: up to there more of noisy ones tell more.
 ENOUGH = 400
@@ -126,7 +127,8 @@ class LoopCloser:
         self._traced_at = model.replay_buffer.target_added
         try:
             measured = Measurements.from_replay(model.replay_buffer, model.env, noise=noise)
-            horizon = (window(measured) - 1) * float(single_env(model.env).unwrapped.dt)  # type: ignore[attr-defined]
+            base: Any = single_env(model.env).unwrapped
+            horizon = (window(measured, contact_changes(base.model, measured)) - 1) * float(base.dt)
             report = self._trace(model, dynamics, measured, horizon)
         except ValueError as error:  # of the data: what was passed was looked at before; a run must not end by it
             self._error = before
@@ -342,9 +344,9 @@ def _say(model: Looping, report: Report, added: list[str], data: str, before: fl
         )
 
 
-def window(measured: Measurements) -> int:
-    """Number of samples in the windows of a trace of transitions."""
-    if measured.exact:
+def window(measured: Measurements, contacts: float) -> int:
+    """Number of samples in the windows of a trace of transitions with so many ``contacts`` that change a second."""
+    if measured.exact or contacts > OFTEN:
         return WINDOW
     ends = [np.flatnonzero(~np.concatenate([[False], episode.usable, [False]])) for episode in measured.episodes]
     stretches = np.concatenate([np.diff(end) - 1 for end in ends])  # of samples whose states are known

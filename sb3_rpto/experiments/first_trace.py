@@ -27,6 +27,7 @@ from sb3_rpto.experiments.closed_loop import (
 )
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.columns import columns_of
+from sb3_rpto.tracing.contacts import contact_changes
 from sb3_rpto.tracing.report import write_atomically
 
 #: A noisy log: runs, steps of the policy in each, and the longest time between two samples in s.
@@ -95,7 +96,8 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
     if not path.exists():
         source = make_source(job.task)
         data = noisy_log(job, folder) if job.noise else first_transitions(job, folder)
-        horizon = None if job.noise else (window(data) - 1) * float(source.unwrapped.dt)  # type: ignore[attr-defined]
+        base: Any = source.unwrapped
+        horizon = None if job.noise else (window(data, contact_changes(base.model, data)) - 1) * float(base.dt)
         began = time.perf_counter()
         report = trace(source, data, TASKS[job.task].declared, seed=job.seed, horizon=horizon, threads=1)
         row = {**asdict(job), **judged(job, report), "seconds": round(time.perf_counter() - began, 1)}

@@ -7,6 +7,8 @@ import mujoco
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.windows import names_of
 
+#: Contacts that change this often a second are said to come and go.
+OFTEN = 0.5
 #: Samples that are looked at, of all runs alike: contacts of one pose after the other.
 MOST = 5_000
 

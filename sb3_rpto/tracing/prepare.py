@@ -14,7 +14,7 @@ from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.library import given
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.contacts import contact_changes
+from sb3_rpto.tracing.contacts import OFTEN, contact_changes
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.model_checks import check_against, soft_friction
 from sb3_rpto.tracing.origin import origin
@@ -32,9 +32,9 @@ OVERLAP = 2 / 3
 SHORT = 15.0
 #: Fewer windows than this overlap.
 FEW = 40
-#: Where contacts come and go this often a second, windows are so many seconds long: an error about the moment of a
-#: touch-down grows to far more than noise.
-OFTEN, BRIEF = 0.5, 0.1
+#: Where contacts come and go, windows are so many seconds long: an error about the moment of a touch-down grows to far
+#: more than noise.
+BRIEF = 0.1
 #: And so many times as many.
 MANY = 4
 #: Where steps in time seem to err by more than the noise, others so many times as short are tried.

@@ -210,10 +210,11 @@ def test_windows_are_as_long_as_stretches_of_known_states() -> None:
         episodes = [SimpleNamespace(usable=np.array(flags, dtype=bool)) for flags in usable]
         return SimpleNamespace(exact=False, episodes=episodes)  # type: ignore[return-value]
 
-    assert closing.window(seen([1] * 20)) == closing.NOISY_WINDOW
-    assert closing.window(seen([1] * 5, [1] * 5, [1] * 20)) == 5
-    assert closing.window(seen([1, 0, 1, 1, 0, 1, 0] + [1] * 9)) == closing.WINDOW
-    assert closing.window(seen([0] * 9)) == closing.WINDOW
+    assert closing.window(seen([1] * 20), 0.0) == closing.NOISY_WINDOW
+    assert closing.window(seen([1] * 20), 5.0) == closing.WINDOW  # where feet touch down
+    assert closing.window(seen([1] * 5, [1] * 5, [1] * 20), 0.0) == 5
+    assert closing.window(seen([1, 0, 1, 1, 0, 1, 0] + [1] * 9), 0.0) == closing.WINDOW
+    assert closing.window(seen([0] * 9), 0.0) == closing.WINDOW
 
 
 @pytest.mark.parametrize(("noise", "traced_at", "due"), [(1e-3, 200, True), (1e-3, 400, False), (None, 200, False)])
