@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from numbers import Integral
@@ -104,6 +105,12 @@ def plain_effects(kwargs: dict[str, Any]) -> dict[str, Any]:
         if not isinstance(effect, Mapping):
             raise TypeError(f"dynamics_kwargs['effects'] must hold effects or their to_json(), not {effect!r}")
     return {**kwargs, "effects": plain}
+
+
+def constructor_names(cls: type) -> set[str]:
+    """Names that a class's constructor takes, its parents' included."""
+    constructors = [vars(parent)["__init__"] for parent in cls.__mro__ if "__init__" in vars(parent)]
+    return {name for function in constructors[:-1] for name in inspect.signature(function).parameters}
 
 
 def list_of_names(declared: Sequence[str]) -> tuple[str, ...]:

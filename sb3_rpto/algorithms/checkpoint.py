@@ -19,7 +19,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_rpto.algorithms.arguments import check_values_of
+from sb3_rpto.algorithms.arguments import check_values_of, constructor_names
 from sb3_rpto.algorithms.bookkeeping import STEP, RuleOfEnvironment, TwoWorlds
 from sb3_rpto.algorithms.machine import check_simulator
 from sb3_rpto.algorithms.worlds import find_ledger
@@ -116,9 +116,10 @@ class Resumable(TwoWorlds):
                 f"load() does not change {', '.join(fixed)}, which the saved dynamics have; begin anew by "
                 f"{cls.__name__}.from_source(...) of the source's SAC"
             )
+        known = constructor_names(cls) | set(inspect.signature(SAC.load).parameters)
         for name in kwargs:
-            if name not in _arguments(cls):
-                raise ValueError(f"load() was given {name!r}, which is no argument; {near(name, _arguments(cls))}")
+            if name not in known:
+                raise ValueError(f"load() was given {name!r}, which is no argument; {near(name, known)}")
         model = super().load(path, gym.make(env) if isinstance(env, str) else env, *args, **kwargs)
         if model._resume_state is None:
             raise ValueError(
@@ -155,12 +156,6 @@ class Resumable(TwoWorlds):
             if hasattr(self.dynamics, "optimizer"):
                 state_dicts.append("dynamics.optimizer")
         return state_dicts, variables
-
-
-def _arguments(cls: type) -> set[str]:
-    """Names that SB3's ``load`` and the constructors of a class take."""
-    functions = [SAC.load, *(vars(parent)["__init__"] for parent in cls.__mro__ if "__init__" in vars(parent))]
-    return {name for function in functions for name in inspect.signature(function).parameters}
 
 
 def _picklable(config: dict[str, Any] | None) -> dict[str, Any] | None:

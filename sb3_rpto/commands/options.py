@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import difflib
 import importlib
-import inspect
 import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
@@ -106,12 +105,6 @@ def check_file(path: str | Path | None, argument: str) -> None:
     """
     if path is not None and not Path(path).is_file():
         raise FileNotFoundError(f"{argument}: there is no file {str(path)!r}; check the path")
-
-
-def constructor_names(cls: type) -> set[str]:
-    """Names that a class's constructor takes, its parents' included."""
-    constructors = [vars(parent)["__init__"] for parent in cls.__mro__ if "__init__" in vars(parent)]
-    return {name for function in constructors[:-1] for name in inspect.signature(function).parameters}
 
 
 def check_names(given: Iterable[str], known: Collection[str]) -> None:

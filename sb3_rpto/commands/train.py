@@ -43,6 +43,7 @@ def run(parsed: argparse.Namespace) -> int:
     """Train, or go on with it."""
     from stable_baselines3 import SAC
 
+    from sb3_rpto.algorithms.arguments import constructor_names
     from sb3_rpto.algorithms.checkpoint import write_atomically
     from sb3_rpto.commands.runs import RunFolder, SavedCurve, load_checkpoint
     from sb3_rpto.zoo.settings import shipped_settings
@@ -52,7 +53,7 @@ def run(parsed: argparse.Namespace) -> int:
     settings = {**shipped_settings("sac", task.env_id), **dict(parsed.set)}
     steps = int(settings.pop("n_timesteps") if parsed.steps is None else parsed.steps)
     settings.pop("n_timesteps", None)
-    options.check_names(settings, options.constructor_names(SAC))
+    options.check_names(settings, constructor_names(SAC))
     settings.setdefault("buffer_size", min(1_000_000, steps))  # SAC's, but no larger a file than there is to keep
     every = parsed.every or max(steps // 10, 1)
     config = {

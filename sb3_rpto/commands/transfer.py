@@ -67,7 +67,7 @@ def run(parsed: argparse.Namespace) -> int:
     """Transfer, or go on with it."""
     from sb3_rpto.algorithms.checkpoint import write_atomically
     from sb3_rpto.commands.runs import RunFolder, SavedCurve
-    from sb3_rpto.experiments.methods import REGISTRY, Run, uses_source_data
+    from sb3_rpto.experiments.methods import REGISTRY, Run
     from sb3_rpto.zoo.settings import ALGORITHMS, shipped_settings
 
     options.check_positive(parsed, "steps", "every", "episodes")
@@ -78,7 +78,7 @@ def run(parsed: argparse.Namespace) -> int:
     target = options.world(parsed.target, "TARGET")
     source = _source(parsed, target)
     settings = dict(parsed.set)
-    if parsed.source_data is not None and not uses_source_data(parsed.method, settings):
+    if parsed.source_data is not None and not REGISTRY[parsed.method].takes_source_data:
         print(f"sb3-rpto: --method {parsed.method} has no use for --source-data", file=sys.stderr)
     _check(parsed.method, settings, parsed.source_model, target)
     budget = shipped_settings(parsed.method if parsed.method in ALGORITHMS else "rpto", target.env_id)["n_timesteps"]
@@ -183,15 +183,16 @@ def _known_settings(method: str) -> set[str]:
 def _arguments_of(method: str) -> set[str]:
     from stable_baselines3 import SAC
 
+    from sb3_rpto.algorithms.arguments import constructor_names
     from sb3_rpto.zoo.settings import ALGORITHMS
 
     if method in ALGORITHMS:
-        return options.constructor_names(ALGORITHMS[method])
+        return constructor_names(ALGORITHMS[method])
     if method == "trpo-warm":
         from sb3_contrib import TRPO
 
-        return options.constructor_names(TRPO)
-    return options.constructor_names(SAC) | BESIDE_SAC.get(method, set())
+        return constructor_names(TRPO)
+    return constructor_names(SAC) | BESIDE_SAC.get(method, set())
 
 
 def _go_on(checkpoint: Path, given: Run, curve: SavedCurve) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import LIBRARY, Effect, from_json
 from sb3_rpto.effects.mjcf import restore, rounded, write_mjcf
-from sb3_rpto.effects.model import ModelSource, alike, load_model
+from sb3_rpto.effects.model import ModelSource, differing, load_model, same_layout
 from sb3_rpto.effects.names import near
 from sb3_rpto.effects.simulation import Simulation, prepare
 from sb3_rpto.effects.units import units_at
@@ -55,8 +55,8 @@ class Corrected:
         :param env: a gymnasium MuJoCo environment; it is changed. :func:`sb3_rpto.envs.corrected.apply_effects` with
             :attr:`effects` leaves it alone
         """
-        effects = self.effects
-        if alike(env.unwrapped.model, self.model):  # type: ignore[attr-defined]
+        effects, given = self.effects, env.unwrapped.model  # type: ignore[attr-defined]
+        if same_layout(given, self.model) and not differing(given, self.model, rounded=True):
             effects = [e for e in effects if carried_by(e) == "wrapper"]
         return CorrectedEnv(env, effects)
 

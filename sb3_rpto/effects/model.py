@@ -107,21 +107,17 @@ def numbers(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     return {name: value for name, value in found.items() if not name.endswith("pathadr")}
 
 
-def differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
-    """Names of the numbers in which two compiled models differ, those that follow from others left out."""
+def differing(one: mujoco.MjModel, other: mujoco.MjModel, rounded: bool = False) -> list[str]:
+    """Names of the numbers in which two compiled models differ, those that follow from others left out.
+
+    :param rounded: but for the digits that an MJCF rounds off, and the statistics, which are of the model as compiled
+    """
     derived = set(mujoco.MjModel._setconst_outputs) - set(mujoco.MjModel._setconst_inputs)
     mine, theirs = numbers(one), numbers(other)
+    if rounded:
+        named = [n for n in mine if n not in derived and not n.startswith("stat.")]
+        return [n for n in named if not np.allclose(mine[n], theirs[n], 1e-4, 1e-9, equal_nan=True)]
     return [n for n in mine if n not in derived and not np.array_equal(mine[n], theirs[n], equal_nan=True)]
-
-
-def alike(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:
-    """Whether two compiled models have the same numbers, but for the digits that an MJCF rounds off."""
-    derived = set(mujoco.MjModel._setconst_outputs) - set(mujoco.MjModel._setconst_inputs)
-    mine, theirs = numbers(one), numbers(other)
-    if {n: v.shape for n, v in mine.items()} != {n: v.shape for n, v in theirs.items()}:
-        return False
-    compared = [n for n in mine if n not in derived and not n.startswith("stat.")]  # of a model as it was compiled
-    return all(np.allclose(mine[n], theirs[n], 1e-4, 1e-9, equal_nan=True) for n in compared)
 
 
 def _public(owner: Any) -> Iterator[tuple[str, Any]]:

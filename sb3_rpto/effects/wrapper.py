@@ -220,9 +220,9 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             q, v = effect.observe(np.array([data.qpos[effect.adr]]), np.array([data.qvel[effect.dof]]), x)
             data.qpos[effect.adr], data.qvel[effect.dof] = q[0], v[0]
         readings = data.sensordata.copy()
-        if sensing and base.model.nsensor:
-            data.sensordata += _errors(base.model, data, qpos, qvel)
         try:
+            if sensing and base.model.nsensor:
+                data.sensordata += _errors(base.model, data, qpos, qvel)
             # A copy: observations may be views of the state.
             return copy.deepcopy(type(base)._get_obs(base, *args, **kwargs))
         finally:

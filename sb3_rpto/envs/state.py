@@ -184,9 +184,14 @@ def _kind(base: gym.Env) -> Any:
         return "own"
     if type(base) in _ENVS:
         return "plain"
-    if hasattr(base, "model") and type(base).__module__.startswith(("gymnasium.envs.mujoco.", "sb3_rpto.envs.")):
-        return tuple(int(getattr(base.model, name)) for name in _MUJOCO_SIZES)
+    if _is_mujoco_task(base):
+        return tuple(int(getattr(base.model, name)) for name in _MUJOCO_SIZES)  # type: ignore[attr-defined]
     raise _Unknown
+
+
+def _is_mujoco_task(base: gym.Env) -> bool:
+    """Whether it is one of gymnasium's or of this package's, whose state is known."""
+    return hasattr(base, "model") and type(base).__module__.startswith(("gymnasium.envs.mujoco.", "sb3_rpto.envs."))
 
 
 def _takes_one(method: Any) -> bool:
@@ -230,7 +235,7 @@ def _whereabouts(env: gym.Env) -> tuple[Any, ...]:
     known: list[Any] = [layer._elapsed_steps for layer in around if isinstance(layer, wrappers.TimeLimit)]
     if type(base) in _ENVS:
         known.append(np.array(base.state).tobytes())  # type: ignore[attr-defined]
-    elif type(base).__module__.startswith("gymnasium.envs.mujoco."):
+    elif _is_mujoco_task(base):
         known += [base.data.time, base.data.qpos.tobytes()]  # type: ignore[attr-defined]
     return tuple(known)
 

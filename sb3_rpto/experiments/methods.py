@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -64,11 +64,13 @@ class Method:
     :param run: spends exactly the budget of target steps and leaves the curve's rows
     :param updates: published updates per target step of a task (its id, or None), of policy or critic
     :param in_batches: learns from many target steps at once, so that it is evaluated after it has
+    :param takes_source_data: has a use for recorded transitions of the source
     """
 
     run: Callable[[Run, LearningCurve], None]
     updates: Callable[[str | None], float]
     in_batches: bool = False
+    takes_source_data: bool = True
 
 
 def _zero_shot(run: Run, curve: LearningCurve) -> None:
@@ -167,12 +169,12 @@ def _number(updates: float) -> Callable[[str | None], float]:
 
 #: All methods, by the names of the command line.
 REGISTRY: dict[str, Method] = {
-    "zero-shot": Method(_zero_shot, _number(0)),
+    "zero-shot": Method(_zero_shot, _number(0), takes_source_data=False),
     "rpo": Method(partial(two_worlds, RPO), _rpo_updates),
     "rto": Method(partial(two_worlds, RTO), _rpto_updates),
     "rpto": Method(partial(two_worlds, RPTO), _rpto_updates),
-    "sac": Method(_sac, _number(1)),
-    "sac-warm": Method(_sac_warm, _number(1)),
+    "sac": Method(_sac, _number(1), takes_source_data=False),
+    "sac-warm": Method(_sac_warm, _number(1), takes_source_data=False),
     "sac-warm-high": Method(_sac_warm_high, _rpto_updates),
     "sac-mixed": Method(_sac_mixed, _number(1)),
     "trpo-warm": Method(_trpo_warm, _number(1 / 2048), in_batches=True),
@@ -180,17 +182,6 @@ REGISTRY: dict[str, Method] = {
     "slbo": Method(_slbo, _slbo_updates, in_batches=True),
     "ptp": Method(partial(two_worlds, PTP), partial(_published, PTP)),
     "pdml": Method(partial(two_worlds, PDML), partial(_published, PDML)),
-    "sysid-retrain": Method(_sysid_retrain, _number(0), in_batches=True),
-    "oracle": Method(_sac_warm, _number(1)),
+    "sysid-retrain": Method(_sysid_retrain, _number(0), in_batches=True, takes_source_data=False),
+    "oracle": Method(_sac_warm, _number(1), takes_source_data=False),
 }
-
-
-def uses_source_data(method: str, settings: Collection[str]) -> bool:
-    """Whether a method has a use for recorded transitions of the source.
-
-    :param method: its name in :data:`REGISTRY`
-    :param settings: names of the arguments that it is given
-    """
-    if method == "sac-warm-high":
-        return "n_critics" in settings
-    return method not in ("zero-shot", "sac", "sac-warm", "oracle", "sysid-retrain")
