@@ -1,8 +1,11 @@
 """Some hundred transitions of a simulator are soon over, and tell all the same what it lacks."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
+from simulated import PENDULUM, briefly, recorded
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_rpto import apply_effects
@@ -43,3 +46,16 @@ def test_a_second_and_a_half_of_a_simulator_are_enough(late) -> None:
     assert [e.label for e in report.effects] == [f"command_delay({motor})" for motor in late]
     for found in report.effects:
         assert found.effect.values == pytest.approx([STEP], rel=1e-3)
+
+
+def test_test_runs_too_short_to_predict_are_told() -> None:
+    whole = recorded()
+    parts = ["train", "train", "train", "test"]
+    episodes = [replace(e, part=part) for e, part in zip(whole.episodes, parts)]
+    names = ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable")
+    arrays = {name: getattr(episodes[-1], name)[:8] for name in names}
+    data = replace(whole, episodes=[*episodes[:-1], replace(episodes[-1], **arrays)])
+    report = briefly(PENDULUM, data, ["hinge.damping"], ["torque_offset"])
+    assert report.before == report.after == []
+    (finding,) = [f for f in report.findings if f.where == "test runs"]
+    assert "no error on unseen runs: the longest stretch of theirs has 35 ms" in finding.message
