@@ -132,7 +132,6 @@ def _estimate(model) -> dict[str, float]:
 
 def _prepare_worker() -> None:
     th.set_num_threads(1)
-    th.set_float32_matmul_precision("medium")
 
 
 def plot(rows: pd.DataFrame, path: Path) -> None:

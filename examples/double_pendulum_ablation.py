@@ -34,7 +34,6 @@ SEEDS = range(10, 15)
 def run(job: tuple[str, int]) -> list[dict[str, Any]]:
     variant, seed = job
     th.set_num_threads(1)
-    th.set_float32_matmul_precision("medium")
     method, settings = VARIANTS[variant]
     model, data = source_policy(Path("runs/double_pendulum"), seed=0)
     rows = transfer(

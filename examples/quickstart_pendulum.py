@@ -10,11 +10,11 @@ from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
-import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_rpto import RPTO
+from sb3_rpto.dynamics.products import fast_products
 from sb3_rpto.experiments.run import evaluate
 
 
@@ -31,12 +31,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/pendulum"))
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    th.set_float32_matmul_precision("medium")
 
     agent, data = arguments.out / "source.zip", arguments.out / "source_data.pkl"
     if not (agent.exists() and data.exists()):
         sac = SAC("MlpPolicy", pendulum(9.81), learning_rate=1e-3, seed=arguments.seed, device="cpu")
-        sac.learn(arguments.source_steps, progress_bar=True)
+        with fast_products():
+            sac.learn(arguments.source_steps, progress_bar=True)
         sac.save_replay_buffer(data)
         sac.save(agent)
 

@@ -83,6 +83,7 @@ def learn(model: SAC, check: gym.Env, steps: int, folder: Path) -> SAC:
     solved = StopTrainingOnRewardThreshold(SOLVED, verbose=0)
     every = {"eval_freq": min(steps, 1_000), "n_eval_episodes": 10, "verbose": 0}
     best = EvalCallback(Monitor(check), callback_on_new_best=solved, best_model_save_path=str(folder), **every)
+    best.eval_env.seed(0)  # it decides when to stop
     model.learn(steps, callback=best)
     model.set_parameters(folder / "best_model.zip", device="cpu")
     return model

@@ -28,6 +28,7 @@ from sb3_rpto import RPTO
 from sb3_rpto.algorithms.update import as_transitions
 from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.base import Transitions
+from sb3_rpto.dynamics.products import fast_products
 from sb3_rpto.experiments.run import LearningCurve, fine_tuned_sac
 
 #: Mean return in the source at which the policy counts as converged: 9,360 is the most there is.
@@ -51,8 +52,10 @@ def source_policy(folder: Path, seed: int) -> tuple[Path, Path]:
         print("training a source policy (once)")
         solved = StopTrainingOnRewardThreshold(SOLVED, verbose=0)
         check = EvalCallback(Monitor(source()), callback_on_new_best=solved, eval_freq=1_000, verbose=0)
+        check.eval_env.seed(seed)  # it decides when to stop
         model = SAC("MlpPolicy", source(), seed=seed, device="cpu")
-        model.learn(40_000, callback=check, progress_bar=True)
+        with fast_products():
+            model.learn(40_000, callback=check, progress_bar=True)
         if check.best_mean_reward < SOLVED:
             print(f"the source policy reaches {check.best_mean_reward:.0f} only: try another --seed")
         model.save_replay_buffer(data_path)
@@ -73,8 +76,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/double_pendulum"))
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    th.set_num_threads(2)
-    th.set_float32_matmul_precision("medium")  # up to twice the speed on CPUs without a fast fp32 product
+    th.set_num_threads(1)  # more are no quicker for networks of this size, and far slower beside other work
     model_path, data_path = source_policy(arguments.out, seed=0)
     every = max(arguments.steps // 6, 1)
 
