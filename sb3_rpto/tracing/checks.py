@@ -121,6 +121,18 @@ def smoothed_velocity(time: np.ndarray, position: np.ndarray, window: int = WIND
     return (by_sample.T / savgol_filter(time, window, 3, deriv=1)).T
 
 
+def angular_velocity(time: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
+    """Angular velocity in the body's frame by the same filter: twice the vector part of q* dq/dt.
+
+    :param time: increasing times in s, shape (T,) with T >= 5
+    :param quaternions: unit ones, w first, neighbours of near sign, shape (T, 4)
+    :return: in rad/s, shape (T, 3)
+    """
+    rate = smoothed_velocity(time, quaternions)
+    w, v = quaternions[:, :1], quaternions[:, 1:]
+    return np.asarray(2 * (w * rate[:, 1:] - rate[:, :1] * v - np.cross(v, rate[:, 1:])))
+
+
 def quantum(velocity: np.ndarray) -> float | None:
     """Smallest step of a coarsely quantised signal, None when the signal is not quantised.
 

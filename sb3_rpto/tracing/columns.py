@@ -20,7 +20,7 @@ class Columns:
     """Names, without their prefix, of what a table holds.
 
     :param qpos: positions, joint by joint in the order of the table; ``root.0`` to ``root.6`` for a free joint
-    :param qvel: velocities in the order of the joints; a scalar joint without a column is listed all the same
+    :param qvel: velocities in the order of the joints; those of a joint without such columns are listed all the same
     :param ctrl: actuators
     :param qfrc: joints whose generalised force was measured
     :param params: settings that differ by run, ``object.parameter``
@@ -33,6 +33,11 @@ class Columns:
     qfrc: tuple[str, ...]
     params: tuple[str, ...]
     missing: tuple[str, ...]
+
+    def slides(self, name: str) -> bool:
+        """Whether the coordinate is the integral of the velocity of that name: not so for quaternions."""
+        joint = joint_of(name)
+        return name == joint or (f"{joint}.6" in self.qpos and name[-1] in "012")
 
 
 def joint_of(name: str) -> str:
@@ -90,15 +95,16 @@ def read_columns(names: Iterable[str], file: str) -> Columns:
     for joint in joints:
         qpos = _coordinates(joint, found["qpos"])
         qvel = _coordinates(joint, found["qvel"])
-        if qpos == [joint]:
-            missing += [] if qvel else [joint]
-            qvel = qvel or [joint]
         sizes = (1, 1) if qpos == [joint] else {4: (4, 3), 7: (7, 6)}.get(len(qpos), (0, 0))
+        if not qvel:
+            qvel = [joint] if qpos == [joint] else [f"{joint}.{i}" for i in range(sizes[1])]
+            missing += qvel
         if (len(qpos), len(qvel)) != sizes or (len(qvel) == 1) != (qvel == [joint]):
             raise ValueError(
                 f"{file}: joint {joint!r} has {len(qpos)} qpos and {len(qvel)} qvel columns; "
                 f"give 'qpos.{joint}' for a scalar joint, "
-                f"4 and 3 numbered ones ('qpos.{joint}.0' …) for a ball joint, 7 and 6 for a free joint"
+                f"4 and 3 numbered ones ('qpos.{joint}.0' …) for a ball joint, 7 and 6 for a free joint, or "
+                "leave out all its velocities"
             )
         velocities += qvel
     for prefix, known in (("qvel", velocities), ("qfrc", velocities), ("enabled", found["ctrl"])):

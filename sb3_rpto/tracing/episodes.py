@@ -231,11 +231,16 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
         episode.qpos[:, i], jumps = checks.unwrap(episode.qpos[:, i])
         if jumps:
             say("wrapped angle", f"{jumps} jump(s) of nearly one turn; unwrapped", f"qpos.{name}")
+    turning = {joint: episode.qpos[:, first : first + 4] for joint, first in _quaternions(columns)}
     for i, name in enumerate(columns.qvel):
         velocity = episode.qvel[:, i]
-        position = episode.qpos[:, columns.qpos.index(name)] if name == joint_of(name) else None
-        if name in columns.missing and position is not None:
-            episode.qvel[:, i] = checks.smoothed_velocity(time, position)
+        position = episode.qpos[:, columns.qpos.index(name)] if columns.slides(name) else None
+        if name in columns.missing:
+            if position is not None:
+                episode.qvel[:, i] = checks.smoothed_velocity(time, position)
+            else:
+                turn = checks.angular_velocity(time, turning[joint_of(name)])
+                episode.qvel[:, i] = turn[:, int(name[-1]) % 3]  # .0 to .2 of a ball joint, .3 to .5 of a free one
             say(
                 "missing velocity",
                 "not measured; estimated from the position by a cubic Savitzky-Golay filter",

@@ -329,7 +329,7 @@ class _Repairs:
             i = c.qpos.index(name)
             if not np.isnan(qpos[:, i]).any():
                 continue
-            if not self._slides(name):
+            if not c.slides(name):
                 raise ValueError(f"episode {episode}: the orientation {name} is not observed; observe it")
             qpos[:, i] = _integral(time, qvel[:, c.qvel.index(name)])
             self.integrated.add(name)
@@ -342,13 +342,6 @@ class _Repairs:
             qpos[1:, i] += 2 * np.pi * np.cumsum(turns)
             self.turns[name] += int(np.abs(turns).sum())
         return qpos, qvel
-
-    def _slides(self, name: str) -> bool:
-        """Whether the coordinate is the integral of the velocity of that name: not so for quaternions."""
-        joint = joint_of(name)
-        if name == joint:
-            return True
-        return sum(joint_of(other) == joint for other in self.columns.qpos) == 7 and name[-1] in "012"
 
     def findings(self) -> list[Finding]:
         """What was repaired in the episodes so far."""

@@ -4,6 +4,7 @@ import re
 from itertools import chain
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -98,8 +99,9 @@ def test_free_joint_has_seven_and_six_columns():
     columns = read_columns(names, "a")
     assert len(columns.qpos) == 7
     assert len(columns.qvel) == 6
-    with pytest.raises(ValueError, match="7 and 6 for a free joint"):
+    with pytest.raises(ValueError, match="7 and 6 for a free joint, or leave out all its velocities"):
         read_columns(names[:-1], "a")
+    assert read_columns(names[:8], "a").missing == columns.qvel
 
 
 def edited(**changes):
@@ -312,6 +314,30 @@ def test_missing_velocity_is_estimated_and_reported():
     data = Measurements.from_tables({"a": edited(qvel__hinge=None)})
     assert kinds(data) == ["missing velocity"]
     np.testing.assert_allclose(data.episodes[0].qvel[:, 0], swing()["qvel.hinge"], atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["free", "ball"])
+def test_missing_velocities_of_a_turning_body_are_estimated(kind):
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="0.001"/><worldbody><body><joint name="top" type="{kind}"/>
+        <geom type="box" size=".1 .2 .3" mass="1"/></body></worldbody></mujoco>"""
+    )
+    state = mujoco.MjData(model)
+    state.qvel[:] = np.linspace(-2.0, 3.0, model.nv)
+    rows = []
+    for _ in range(400):
+        rows.append(np.concatenate([[state.time], state.qpos, state.qvel]))
+        mujoco.mj_step(model, state)
+    names = ["time", *(f"qpos.top.{i}" for i in range(model.nq)), *(f"qvel.top.{i}" for i in range(model.nv))]
+    table = dict(zip(names, np.array(rows).T))
+    measured = np.stack([table.pop(name) for name in names if name.startswith("qvel")], 1)
+    turn = slice(model.nq - 3, model.nq + 1)
+    for name in names[turn]:
+        table[name] = table[name] * np.repeat([1.0, -1.0], 200)  # one orientation, the other quaternion
+    data = Measurements.from_tables({"a": table})
+    assert set(kinds(data)) == {"missing velocity", "quaternion sign"}
+    assert data.columns.missing == data.columns.qvel
+    np.testing.assert_allclose(data.episodes[0].qvel, measured, atol=0.02)
 
 
 def test_velocity_estimate_is_exact_for_constant_speed_on_a_jittered_clock():
