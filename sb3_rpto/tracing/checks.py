@@ -20,6 +20,8 @@ SLOPE = (0.8, 1.25)
 """Slopes of measured velocity against the position's change that pass for one."""
 SPAN = 16
 """Samples over which velocity and change of position are compared."""
+CLEAR = 0.5
+"""Another convention of rotations fits clearly when it leaves at most so much of what MuJoCo's leaves."""
 WINDOW = 9
 """Samples of the filter that differentiates positions."""
 
@@ -131,6 +133,31 @@ def angular_velocity(time: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
     rate = smoothed_velocity(time, quaternions)
     w, v = quaternions[:, :1], quaternions[:, 1:]
     return np.asarray(2 * (w * rate[:, 1:] - rate[:, :1] * v - np.cross(v, rate[:, 1:])))
+
+
+def turning_convention(time: np.ndarray, quaternions: np.ndarray, velocity: np.ndarray) -> str | None:
+    """What speaks for another convention than MuJoCo's: a measured angular velocity that fits that one, not this.
+
+    :param time: increasing times in s, shape (T,) with T >= 5
+    :param quaternions: unit ones, as they were given, shape (T, 4)
+    :param velocity: measured angular velocity in rad/s, shape (T, 3)
+    :return: the convention in words; None where w first and the body's frame fit, or nothing does
+    """
+    conjugate = np.array([1.0, -1.0, -1.0, -1.0])  # turns the other way, and swaps the frames
+    scalar_last = np.roll(quaternions, 1, axis=1)
+    readings = {
+        "": angular_velocity(time, quaternions),
+        "angular velocities in the world's frame": -angular_velocity(time, quaternions * conjugate),
+        "quaternions x, y, z, w": angular_velocity(time, scalar_last),
+        "quaternions x, y, z, w and angular velocities in the world's frame": -angular_velocity(
+            time, scalar_last * conjugate
+        ),
+    }
+    size = float(np.linalg.norm(velocity))
+    errors = {said: float(np.linalg.norm(reading - velocity)) for said, reading in readings.items()}
+    best = min(errors, key=lambda said: errors[said])
+    clear = errors[best] < CLEAR * min(size, errors[""])
+    return best if best and clear else None
 
 
 def quantum(velocity: np.ndarray) -> float | None:

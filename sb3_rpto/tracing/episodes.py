@@ -224,6 +224,12 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
         flips = checks.align_quaternions(episode.qpos[:, first : first + 4])
         if flips:
             say("quaternion sign", f"{flips} change(s) between q and -q, one orientation; aligned", f"qpos.{joint}")
+        turn = [i for i, name in enumerate(columns.qvel) if joint_of(name) == joint and name not in columns.missing]
+        measured, oriented = episode.qvel[:, turn[-3:]], episode.qpos[:, first : first + 4]
+        other = checks.turning_convention(time, oriented, measured) if turn else None
+        if other is not None:
+            message = f"the numbers fit {other}; kept as they are: give w, x, y, z, and velocities in the body's frame"
+            say("other convention", message, f"qpos.{joint}")
     for i, name in enumerate(columns.qpos):
         # A turn means nothing to the coordinates of a ball or free joint.
         if name != joint_of(name):
@@ -239,8 +245,8 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
             if position is not None:
                 episode.qvel[:, i] = checks.smoothed_velocity(time, position)
             else:
-                turn = checks.angular_velocity(time, turning[joint_of(name)])
-                episode.qvel[:, i] = turn[:, int(name[-1]) % 3]  # .0 to .2 of a ball joint, .3 to .5 of a free one
+                rates = checks.angular_velocity(time, turning[joint_of(name)])
+                episode.qvel[:, i] = rates[:, int(name[-1]) % 3]  # .0 to .2 of a ball joint, .3 to .5 of a free one
             say(
                 "missing velocity",
                 "not measured; estimated from the position by a cubic Savitzky-Golay filter",

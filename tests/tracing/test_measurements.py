@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sb3_rpto.experiments.planting import generate
 from sb3_rpto.tracing import Measurements, checks
 from sb3_rpto.tracing.checks import SLOPE, grouped, quantum, smoothed_velocity, split_at_gaps, unwrap, velocity_slope
-from sb3_rpto.tracing.columns import read_columns
+from sb3_rpto.tracing.columns import columns_of, read_columns
 
 MEASURED = Path(__file__).parents[3] / "shared" / "measured"
 
@@ -316,8 +316,8 @@ def test_missing_velocity_is_estimated_and_reported():
     np.testing.assert_allclose(data.episodes[0].qvel[:, 0], swing()["qvel.hinge"], atol=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["free", "ball"])
-def test_missing_velocities_of_a_turning_body_are_estimated(kind):
+def tumble(kind):
+    """A body thrown with a spin about all axes: its columns, times (T,), positions and velocities (T, nq + nv)."""
     model = mujoco.MjModel.from_xml_string(
         f"""<mujoco><option timestep="0.001"/><worldbody><body><joint name="top" type="{kind}"/>
         <geom type="box" size=".1 .2 .3" mass="1"/></body></worldbody></mujoco>"""
@@ -328,16 +328,45 @@ def test_missing_velocities_of_a_turning_body_are_estimated(kind):
     for _ in range(400):
         rows.append(np.concatenate([[state.time], state.qpos, state.qvel]))
         mujoco.mj_step(model, state)
-    names = ["time", *(f"qpos.top.{i}" for i in range(model.nq)), *(f"qvel.top.{i}" for i in range(model.nv))]
-    table = dict(zip(names, np.array(rows).T))
-    measured = np.stack([table.pop(name) for name in names if name.startswith("qvel")], 1)
-    turn = slice(model.nq - 3, model.nq + 1)
-    for name in names[turn]:
-        table[name] = table[name] * np.repeat([1.0, -1.0], 200)  # one orientation, the other quaternion
-    data = Measurements.from_tables({"a": table})
+    table = np.array(rows)
+    return columns_of(model), table[:, 0], table[:, 1:]
+
+
+@pytest.mark.parametrize("kind", ["free", "ball"])
+def test_missing_velocities_of_a_turning_body_are_estimated(kind):
+    columns, time, values = tumble(kind)
+    positions, velocities = np.split(values, [len(columns.qpos)], axis=1)
+    positions[200:, -4:] *= -1  # the same orientations
+    names = [f"qpos.{name}" for name in columns.qpos]
+    data = Measurements.from_tables({"a": {"time": time, **dict(zip(names, positions.T))}})
     assert set(kinds(data)) == {"missing velocity", "quaternion sign"}
     assert data.columns.missing == data.columns.qvel
-    np.testing.assert_allclose(data.episodes[0].qvel, measured, atol=0.02)
+    np.testing.assert_allclose(data.episodes[0].qvel, velocities, atol=0.02)
+
+
+@pytest.mark.parametrize("kind", ["free", "ball"])
+@pytest.mark.parametrize(
+    ("last", "world", "said"),
+    [
+        (False, False, None),
+        (True, False, "quaternions x, y, z, w"),
+        (False, True, "angular velocities in the world's frame"),
+        (True, True, "quaternions x, y, z, w and angular velocities in the world's frame"),
+    ],
+)
+def test_another_convention_of_rotations_is_told(kind, last, world, said):
+    columns, time, values = tumble(kind)
+    turn = slice(len(columns.qpos) - 4, len(columns.qpos))
+    if world:
+        for row in values:
+            mujoco.mju_rotVecQuat(row[-3:], row[-3:].copy(), row[turn].copy())
+    if last:
+        values[:, turn] = np.roll(values[:, turn], -1, axis=1)
+    names = [*(f"qpos.{name}" for name in columns.qpos), *(f"qvel.{name}" for name in columns.qvel)]
+    data = Measurements.from_tables({"a": {"time": time, **dict(zip(names, values.T))}})
+    told = [finding.message for finding in data.findings if finding.kind == "other convention"]
+    assert len(told) == (said is not None)
+    assert said is None or f"the numbers fit {said};" in told[0]
 
 
 def test_velocity_estimate_is_exact_for_constant_speed_on_a_jittered_clock():
