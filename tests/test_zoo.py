@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 import sys
 from pathlib import Path
 
@@ -12,6 +13,8 @@ import pytest
 import torch as th
 from conftest import SMALL_ENSEMBLE, pendulum
 from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_rpto import RPO, RPTO
 from sb3_rpto.envs import tasks
@@ -215,6 +218,21 @@ def test_another_factor_is_a_target_too(zoo, agent, tmp_path):
     source = ["--source-model", str(agent), "-n", "4", "--eval-freq", "2", "--eval-episodes", "1"]
     run = launch(tmp_path, "rpo", *source, "--eval-env-kwargs", "shift:'limb-x3'", *SMALL, env=SOURCE)
     assert RPO.load(final(run), device="cpu").num_timesteps == 4
+
+
+@pytest.mark.parametrize("place", ["vecnormalize.pkl", "{source}/vecnormalize.pkl", "sac/vecnormalize.pkl"])
+def test_a_source_agent_brings_its_statistics_along(zoo, agent, tmp_path, place):
+    from sb3_rpto.zoo.manager import Start, TransferManager
+
+    shutil.copy(agent, tmp_path / "sac.zip")
+    seen = VecNormalize(make_vec_env(SOURCE))
+    seen.obs_rms.mean[:] = 7.0
+    path = tmp_path / place.format(source=SOURCE)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    seen.save(str(path))
+    manager = TransferManager.__new__(TransferManager)
+    manager.trained_agent, manager.start = "", Start(SOURCE, str(tmp_path / "sac.zip"))
+    assert manager._maybe_normalize(make_vec_env(SOURCE), False).obs_rms.mean.tolist() == [7.0] * 4
 
 
 def test_sac_that_was_trained_takes_no_random_steps_in_the_target(zoo, agent, tmp_path):

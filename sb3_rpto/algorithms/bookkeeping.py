@@ -108,6 +108,7 @@ class TwoWorlds(PolicySnapshots):
     _callback: BaseCallback | None
     #: where a loaded checkpoint left the worlds, until ``learn()`` puts them back
     _resume_state: dict[str, Any] | None
+    _reseeded: bool
 
     # ------------------------------------------------------------------ the worlds
 
@@ -222,10 +223,14 @@ class TwoWorlds(PolicySnapshots):
         return None if self.env is None else unwrap_vec_normalize(self.env)
 
     def set_random_seed(self, seed: int | None = None) -> None:
-        """Seed both worlds and the model, each with its own stream; with None nothing is seeded."""
+        """Seed both worlds and the model, each with its own stream; with None nothing is seeded.
+
+        After a checkpoint is loaded, the run that goes on draws from the new streams instead of those that were saved.
+        """
         super().set_random_seed(seed)
         if seed is None:
             return
+        self._reseeded = True
         if self.target_env is not None:
             self.target_env.seed(seed + TARGET_SEED_OFFSET)
         if self.dynamics is not None:

@@ -130,6 +130,9 @@ class Resumable(TwoWorlds):
             saved_by = "RPO" if model.dynamics is None else "RTO or RPTO"
             raise ValueError(f"{path} was saved by {saved_by}, {cls.__name__} cannot continue it; load it there")
         check_values_of(model)
+        model._reseeded = False  # the seed of its beginning is not one given now
+        if kwargs.get("seed") is not None:
+            model.set_random_seed(kwargs["seed"])
         model._warm = model._resume_state["warm"]
         if model._resume_state.get("learner") is not None:  # set_parameters() has dropped it
             model.snapshots["learner"] = model._resume_state["learner"]
@@ -220,7 +223,8 @@ def resume(model: Resumable) -> None:
             "when the checkpoint was saved, and can save its state)",
             stacklevel=3,
         )
-    _restore_streams(state)
+    if not model._reseeded:
+        _restore_streams(state)
 
 
 def resume_source_phase(model: Resumable) -> None:
@@ -231,7 +235,8 @@ def resume_source_phase(model: Resumable) -> None:
     assert model.env is not None  # learn() has checked
     _put_back(model.env, state["source"])
     model._source_first_obs = np.asarray(model.env.reset())
-    _restore_streams(state)
+    if not model._reseeded:
+        _restore_streams(state)
 
 
 def _restore_streams(state: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics
+from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.effects.model import differing
@@ -55,9 +56,12 @@ def check_simulator(source: VecEnv, dynamics: Dynamics | None) -> None:
     :param dynamics: which were built from an earlier one
     """
     physical = dynamics.physical if isinstance(dynamics, ResidualDynamics) else dynamics
-    if not isinstance(physical, PhysicalDynamics):
+    if isinstance(physical, PhysicalDynamics):
+        found = differing(physical.model, mujoco_model(single_env(source)))
+    elif isinstance(physical, CartPoleDynamics):
+        found = [name for name, value in cartpole_constants(source).items() if value != physical.nominal[name]]
+    else:
         return
-    found = differing(physical.model, mujoco_model(single_env(source)))
     if found:
         warnings.warn(
             f"env simulates another model than the one that phi was fitted for ({', '.join(found[:3])} differ): "

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_rpto.algorithms.mbpo import MBPO
 from sb3_rpto.algorithms.source import BranchSource, SourceWorld
@@ -107,6 +108,13 @@ class PDML(MBPO):
             raise ValueError("target_data: PDML weighs blocks by the policies that collected them; pass target_env")
         if self.use_sde:
             raise NotImplementedError("use_sde=True: PDML compares Gaussian policies; leave it out")
+
+    def set_target_env(self, env: GymEnv | str) -> None:
+        """Set the target; in the place of another one, with no blocks of it."""
+        replaced = self.target_env is not None
+        super().set_target_env(env)
+        if replaced:
+            self.blocks, self.shares, self._since_block = [], np.ones(1), 0
 
     def _make_source_world(self) -> SourceWorld:
         assert self.dynamics is not None  # it updates them

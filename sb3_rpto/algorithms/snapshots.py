@@ -39,7 +39,7 @@ class PolicySnapshots(RelativeUpdate):
         self.snapshots.pop("learner", None)
 
     def rollback(self, to: str = "best") -> None:
-        """Go back to a policy that was kept.
+        """Go back to a policy that was kept; a VecNormalize keeps the statistics that it has now.
 
         :param to: "best" (in the target), "source" (as it came) or, where a trace accounts for the target,
             "simulator" (the best in the fitted one); restores actor, critics and temperature

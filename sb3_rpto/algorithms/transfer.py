@@ -205,6 +205,7 @@ class TransferAlgorithm(Looping):
         self._has_target_rules = False
         self._callback = None
         self._resume_state = None
+        self._reseeded = False
 
         if _init_setup_model:
             self._apply_preset()

@@ -13,6 +13,7 @@ import numpy as np
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_rpto.algorithms import recorded
 from sb3_rpto.algorithms.checkpoint import Resumable
@@ -55,7 +56,10 @@ def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
     if not isinstance(source_model, str | os.PathLike):
         raise TypeError(f"source_model must be a SAC or the path of its zip, not {type(source_model).__name__}")
     try:
-        return SAC.load(source_model, device=device)
+        sac = SAC.load(source_model, device=device)
+        if not isinstance(sac.policy, SACPolicy):  # TQC's zips have all that SAC asks for
+            raise TypeError(f"its policy is a {type(sac.policy).__name__}")
+        return sac
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"source_model={str(source_model)!r} is not the zip of a SAC ({error}); a model of this package goes on "
@@ -216,11 +220,12 @@ def _train_in_source(model: Resumable, source_timesteps: int, progress_bar: bool
 
 
 def _report(model: Resumable, source: EpisodeSource) -> None:
-    """Log the source phase in a group of its own and leave a checkpoint where the logger has a folder."""
+    """Log the source phase in a group of its own and leave a checkpoint where the user gave the logger a folder."""
     for name, value in {"timesteps": model._pretrained_steps, **source.log()}.items():
         model.logger.record(f"pretrain/{name}", value)
     model.logger.dump(step=0)
-    if model.logger.dir is not None:
+    given = model._custom_logger or model.tensorboard_log is not None or "SB3_LOGDIR" in os.environ
+    if given and model.logger.dir is not None:
         folder = pathlib.Path(model.logger.dir)
         model.save(folder / "pretrain.zip")
         model.save_replay_buffer(folder / "pretrain_replay_buffer.pkl")
@@ -231,6 +236,8 @@ def _carry_temperature(sac: SAC, model: Resumable) -> None:
     if model.log_ent_coef is None:
         learned = None if sac.log_ent_coef is None else sac.log_ent_coef.detach().exp().reshape(())
         model.ent_coef_tensor = (sac.ent_coef_tensor if learned is None else learned).clone().to(model.device)
+    elif sac.log_ent_coef is None and float(sac.ent_coef_tensor) == 0.0:
+        return  # what is learned is a logarithm, which 0 has not: it begins where ent_coef says
     elif sac.log_ent_coef is None:
         model.log_ent_coef.data.fill_(float(sac.ent_coef_tensor.log()))
     else:

@@ -153,8 +153,9 @@ def raw_terminal(env: VecEnv, index: Any, terminal: np.ndarray) -> np.ndarray:
         return terminal
     inner = env.unwrapped
     held = inner.buf_infos[index].get("terminal_observation") if isinstance(inner, DummyVecEnv) else None
-    again = None if held is None else np.asarray(normaliser.normalize_obs(held))
-    if again is not None and again.shape == terminal.shape and np.allclose(again, terminal):
+    if held is None or np.shape(held) != terminal.shape:  # as it is below a VecFrameStack
+        return normaliser.unnormalize_obs(terminal)  # type: ignore[return-value]
+    if np.allclose(np.asarray(normaliser.normalize_obs(held)), terminal):
         return np.asarray(held)
     return normaliser.unnormalize_obs(terminal)  # type: ignore[return-value]
 

@@ -114,7 +114,7 @@ class SavedCurve(LearningCurve):
 
     :param run: whose checkpoints
     :param make_env: makes an evaluation environment
-    :param every: steps between evaluations
+    :param every: steps between evaluations; the last is at the end, whatever it is
     :param total: steps of the run; after the last there is no checkpoint
     :param n_episodes: of an evaluation
     :param seed: of the evaluation's initial states
@@ -138,7 +138,7 @@ class SavedCurve(LearningCurve):
         resumable: bool = True,
         say: Callable[[str], None] | None = None,
     ) -> None:
-        super().__init__(make_env, every, n_episodes, seed, after_update=after_update)
+        super().__init__(make_env, {*range(every, total, every), total}, n_episodes, seed, after_update=after_update)
         self.run, self.total, self.until, self.resumable, self.say = run, total, until, resumable, say
         #: the model that the newest row is of
         self.judged: Any = None

@@ -16,6 +16,7 @@ from torch import nn
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
 from sb3_rpto.envs.cartpole import CartPoleParameters, cartpole_reward, cartpole_step, cartpole_termination
+from sb3_rpto.envs.rules import changing_wrappers
 
 #: The constants that may be declared, with their default bounds; None is a tenth to ten times the nominal value.
 DECLARABLE: dict[str, tuple[float, float] | None] = {
@@ -36,26 +37,36 @@ SINGULAR = 1e-8
 
 def is_cartpole(env: gym.Env | VecEnv) -> bool:
     """Whether :func:`cartpole_constants` finds a cart-pole."""
-    return isinstance(_parameters(env), CartPoleParameters)
+    found = _parameters(env)
+    return bool(found) and isinstance(found[0], CartPoleParameters)
 
 
 def cartpole_constants(env: gym.Env | VecEnv) -> dict[str, float]:
-    """The constants of a cart-pole, read through its wrappers.
+    """The constants of a cart-pole, read through wrappers that leave its steps as they are.
 
     :param env: a (wrapped or vectorised) :class:`~sb3_rpto.envs.cartpole.ContinuousCartPoleEnv`
     :return: every field of :class:`~sb3_rpto.envs.cartpole.CartPoleParameters`
-    :raises ValueError: if there is no cart-pole below the wrappers
+    :raises ValueError: if there is no cart-pole below the wrappers, several differ, or a wrapper may change what goes
+        in or comes out
     """
     found = _parameters(env)
-    if not isinstance(found, CartPoleParameters):
+    if not found or not isinstance(found[0], CartPoleParameters):
         raise ValueError(f"env has no cart-pole parameters: {env}; pass a ContinuousCartPoleEnv")
-    return asdict(found)
+    if any(other != found[0] for other in found[1:]):
+        raise ValueError("env holds cart-poles with different constants, and phi is the constants of one; give one")
+    strange = changing_wrappers(env)
+    if strange:
+        raise ValueError(
+            f"env: wrapper(s) {', '.join(sorted(strange))} may change observations, actions or rewards, which the "
+            "cart-pole's equations know nothing of; leave them out, or pass dynamics='ensemble'"
+        )
+    return asdict(found[0])
 
 
-def _parameters(env: gym.Env | VecEnv) -> Any:
+def _parameters(env: gym.Env | VecEnv) -> list[Any]:
     if isinstance(env, VecEnv):
-        return env.get_attr("parameters")[0] if env.has_attr("parameters") else None
-    return env.get_wrapper_attr("parameters") if env.has_wrapper_attr("parameters") else None
+        return env.get_attr("parameters") if env.has_attr("parameters") else []
+    return [env.get_wrapper_attr("parameters")] if env.has_wrapper_attr("parameters") else []
 
 
 class _Linearisation(NamedTuple):

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 
@@ -70,7 +71,7 @@ class EnsembleDynamics(Dynamics):
     :param learning_rate: Adam's; its moments are kept between fits
     :param batch_size: transitions per member and gradient step
     :param holdout_ratio: share of the data held out, in (0, 0.5]
-    :param max_holdout: most transitions held out; the oldest candidates are, later ones are trained on
+    :param max_holdout: most transitions held out, spread over all data
     :param patience: epochs without an improvement of more than 1 % in any member's holdout error that end a fit
     :param max_steps: gradient steps a fit makes at most, unless it is told otherwise
     :param min_holdout_for_elites: holdout transitions from which on a fit ranks the members anew; below, the ranking is
@@ -113,6 +114,11 @@ class EnsembleDynamics(Dynamics):
         for name, space in (("observation_space", observation_space), ("action_space", action_space)):
             if not isinstance(space, spaces.Box) or len(space.shape) != 1:
                 raise ValueError(f"{name} must be a flat Box, got {space}; flatten it with a wrapper first")
+            if not np.issubdtype(space.dtype, np.floating):  # changes and rewards are no whole numbers
+                raise ValueError(
+                    f"{name} holds {space.dtype}, and the model predicts changes; wrap the environments in "
+                    "gymnasium.wrappers.DtypeObservation(env, np.float32) or give it a Box of floats"
+                )
         if not 1 <= n_elites <= n_members:
             raise ValueError(f"n_elites must be in 1..n_members ({n_members}), got {n_elites}")
         if not 0.0 < holdout_ratio <= 0.5:
@@ -244,12 +250,16 @@ class EnsembleDynamics(Dynamics):
     def holdout_mask(self, n: int) -> th.Tensor:
         """Which of the first ``n`` transitions are held out, (n,) bool.
 
-        Transition i is a candidate if the fractional part of i times the golden ratio is below ``holdout_ratio``: an
-        even share of every stretch of data, in step with no period of it (several environments, an episode's length).
+        Transition i is held out if the fractional part of i times the golden ratio is below ``holdout_ratio``, and
+        among the ``max_holdout`` smallest: an even share of every stretch of data, in step with no period of it
+        (several environments, an episode's length). As data are added the bound falls: what was trained on is never
+        held out later.
         """
-        position = th.arange(n, dtype=th.float64) * ((math.sqrt(5.0) - 1.0) / 2.0)
-        candidate = position.frac() < self.holdout_ratio
-        return (candidate & (candidate.cumsum(0) <= self.max_holdout)).to(self.device)
+        share = (th.arange(n, dtype=th.float64) * ((math.sqrt(5.0) - 1.0) / 2.0)).frac()
+        held = share < self.holdout_ratio
+        if int(held.sum()) > self.max_holdout:
+            held = share <= share.kthvalue(self.max_holdout).values
+        return held.to(self.device)
 
     def _train_epoch(self, train: _Examples, max_steps: int) -> tuple[th.Tensor, int]:
         """Pass through the data, each member in its own order; return the mean NLL and the number of steps."""

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 Rule = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
@@ -27,9 +26,12 @@ Rule = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
 HARMLESS_WRAPPERS = {
     *("TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "Autoreset", "Monitor", "RecordEpisodeStatistics"),
     *("RecordVideo", "RenderCollection", "HumanRendering", "DynamicsEnv", "CorrectedEnv", "ShiftedEnv", "StandingEnv"),
+    "PatchedTimeLimit",  # rl_zoo3's
 }
 # The action of the buffer is not the one that the task's reward sees; its termination does not mind.
 _CHANGES_ACTIONS = {"ClipAction", "RescaleAction"}
+# Methods of a task that neither pay nor end episodes.
+_NOT_RULES = {"__init__", "reset", "reset_model", "render", "close", "_get_reset_info"}
 HARMLESS_VEC_WRAPPERS = (VecNormalize, VecMonitor, VecCheckNan)  # VecNormalize: buffers hold raw data
 
 
@@ -62,6 +64,11 @@ def task_rules(env: gym.Env | VecEnv) -> TaskRules:
     if own_termination is not None:
         termination = partial(or_not_finite, own_termination)
     return TaskRules(view.own_rule("reward_fn") or reward, termination)
+
+
+def changing_wrappers(env: gym.Env | VecEnv) -> set[str]:
+    """Names of the wrappers of (the first environment of) ``env`` that may change what goes in or comes out."""
+    return _View(env).strange
 
 
 def misfit(rule: Rule, observation_space: gym.Space, action_space: gym.Space) -> str | None:
@@ -105,6 +112,11 @@ class _View:
         self.wrappers = set(re.findall(r"\w+", parts[1])) if parts else set()
         self.id: str | None = parts[3] if parts else None
 
+    @property
+    def strange(self) -> set[str]:
+        """Names of the wrappers that may change observations, actions, rewards or terminations."""
+        return self.wrappers - HARMLESS_WRAPPERS if self.understood else {"of another kind"}
+
     def _call(self, method: str) -> Any:
         if self.env is not None:
             return self.env.get_wrapper_attr(method)()
@@ -129,11 +141,8 @@ class _View:
         return self.has("alters_observations") and self["alters_observations"]
 
     def own_rule(self, name: str) -> Rule | None:
-        """The environment's own rule, unless a wrapper changes what goes into or comes out of it."""
-        changing: list[type[gym.Wrapper]] = [gym.ObservationWrapper, gym.ActionWrapper]
-        if name == "reward_fn":
-            changing.append(gym.RewardWrapper)
-        if not self.has(name) or self.sensed or any(self._is_wrapped(wrapper) for wrapper in changing):
+        """The environment's own rule, unless a wrapper may change what goes into or comes out of it."""
+        if not self.has(name) or self.sensed or self._changing(name):
             return None
         env = self.env or self._twin()
         rule = env.get_wrapper_attr(name) if env is not None and env.has_wrapper_attr(name) else None
@@ -148,10 +157,17 @@ class _View:
             )
         return rule if found is None else None
 
-    def _is_wrapped(self, wrapper: type[gym.Wrapper]) -> bool:
-        if self.env is not None:
-            return is_wrapped(self.env, wrapper)
-        return self.vec_env.env_is_wrapped(wrapper, indices=0)[0]  # type: ignore[union-attr]
+    def _changing(self, name: str) -> bool:
+        """Whether a wrapper outside of what has the rule may change what the rule is about; an unknown one may."""
+        if self.env is None:
+            return bool(self.strange)
+        layer = self.env
+        while isinstance(layer, gym.Wrapper) and not hasattr(layer, name):
+            steps = type(layer).step is not gym.Wrapper.step and type(layer).__name__ not in HARMLESS_WRAPPERS
+            if steps and not (name == "termination_fn" and isinstance(layer, gym.RewardWrapper)):
+                return True
+            layer = layer.env
+        return False
 
     def _twin(self) -> gym.Env | None:
         """An environment made as the one in the subprocess was; a bound method cannot be sent without its env."""
@@ -177,15 +193,25 @@ def _known_task(view: _View) -> TaskRules:
 
 def _task_name(view: _View) -> str | None:
     """The task's gymnasium name: by class for gymnasium's and our own environments, else by id."""
-    base = type(view.env.unwrapped) if view.env is not None else object
-    if base.__module__.startswith(("gymnasium.envs.", "sb3_rpto.")):
-        for cls in base.__mro__:
+    if view.env is not None:
+        family = type(view.env.unwrapped).__mro__
+        for i, cls in enumerate(family):
             if cls.__module__.startswith(("gymnasium.envs.mujoco.", "gymnasium.envs.classic_control.")):
                 name = cls.__name__.removesuffix("Env")
+                heirs = [heir for heir in family[:i] if not heir.__module__.startswith(("gymnasium.", "sb3_rpto."))]
+                if any(_changes_task(heir, cls) for heir in heirs):
+                    return None
                 return "MountainCarContinuous" if name == "Continuous_MountainCar" else name
+        if not family[0].__module__.startswith(("gymnasium.", "sb3_rpto.")):
+            return None  # somebody's own task, whatever it is called
     # Ours may be targets: rpto/Hopper-gravity-x0.5-v0.
     task = re.fullmatch(r"rpto/(\w+)(?:-[\w.-]+)?-v\d+", view.id or "") or re.fullmatch(r"(\w+)-v\d+", view.id or "")
     return task[1] if task else None
+
+
+def _changes_task(heir: type, task: type) -> bool:
+    """Whether a class has a method of its own in the place of one that a known task's rules are about."""
+    return any(callable(method) and name in vars(heir) for name, method in vars(task).items() if name not in _NOT_RULES)
 
 
 # --- terminations -----------------------------------------------------------------------------------------------

@@ -146,9 +146,14 @@ class TransferManager(ExperimentManager):
         )
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
-        """As the zoo's; a checkpoint's statistics are those that were saved with it."""
-        statistics = beside(self.trained_agent, "vecnormalize")
-        if statistics is None or not statistics.is_file():
+        """As the zoo's; the statistics of a checkpoint, or of a source agent, are those that were saved with it."""
+        candidates = [beside(self.trained_agent, "vecnormalize")]
+        if self.start is not None and self.start.source_model is not None and not self.trained_agent:
+            agent = Path(self.start.source_model)
+            candidates = [beside(str(agent), "vecnormalize")]
+            candidates += [agent.parent / name / "vecnormalize.pkl" for name in (self.start.source_env, agent.stem)]
+        statistics = next((path for path in candidates if path is not None and path.is_file()), None)
+        if statistics is None:
             return super()._maybe_normalize(env, eval_env)
         env = VecNormalize.load(str(statistics), env)
         if eval_env:

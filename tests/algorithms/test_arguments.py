@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from conftest import ALGORITHMS, SMALL_ENSEMBLE, pendulum, small
 from gymnasium import spaces
+from sb3_contrib import TQC
 from stable_baselines3 import PPO, TD3
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps
@@ -254,6 +255,12 @@ def test_a_source_model_of_another_kind_is_refused(agent, error, tmp_path):
     other.save(tmp_path / "other.zip")
     with pytest.raises(ValueError, match="is not the zip of a SAC"):
         RPTO.from_source(tmp_path / "other.zip", pendulum(), pendulum(12.0))
+
+
+def test_a_zip_of_tqc_is_no_sacs_though_it_loads_as_one(tmp_path):
+    TQC("MlpPolicy", pendulum(), policy_kwargs={"net_arch": [4]}, buffer_size=10).save(tmp_path / "tqc.zip")
+    with pytest.raises(ValueError, match=r"is not the zip of a SAC \(its policy is a TQCPolicy"):
+        RPTO.from_source(tmp_path / "tqc.zip", pendulum(), pendulum(12.0))
 
 
 @pytest.mark.parametrize("given", [pendulum, [pendulum]])

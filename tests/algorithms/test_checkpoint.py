@@ -1,6 +1,7 @@
 """A checkpoint is complete: resuming equals not having stopped."""
 
 import contextlib
+import tempfile
 import threading
 
 import gymnasium as gym
@@ -236,6 +237,36 @@ def test_a_killed_source_phase_goes_on_from_its_checkpoint(tmp_path):
     assert resumed._pretrained_steps == 300
 
 
+def test_a_source_phase_leaves_nothing_where_no_folder_was_given(tmp_path, monkeypatch):
+    monkeypatch.delenv("SB3_LOGDIR", raising=False)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    model = small(RPO).learn(5, source_timesteps=60)
+    assert model.logger.dir.startswith(str(tmp_path))  # SB3's own, for nobody
+    assert not list(tmp_path.rglob("pretrain*"))
+
+
+@pytest.mark.parametrize("how", ["set_random_seed", "load"])
+def test_a_seed_that_is_given_after_loading_counts(how, tmp_path):
+    model = small(RPO).learn(10, source_timesteps=60)
+    model.save(tmp_path / "m.zip")
+    model.save_replay_buffer(tmp_path / "m.pkl")
+
+    def branch(seed):
+        given = {"seed": seed} if how == "load" and seed is not None else {}
+        loaded = RPO.load(tmp_path / "m.zip", pendulum(), target_env=pendulum(12.0), **given)
+        loaded.load_replay_buffer(tmp_path / "m.pkl")
+        if how != "load" and seed is not None:
+            loaded.set_random_seed(seed)
+        return loaded.learn(10, reset_num_timesteps=False)
+
+    one, again, other, none, none_again = map(branch, (1, 1, 2, None, None))
+    assert_same(one, again)
+    assert_same(none, none_again)
+    for different in (other, none):
+        with pytest.raises(AssertionError):
+            assert_same(one, different)
+
+
 def test_a_source_phase_goes_on_with_its_statistics(tmp_path, monkeypatch):
     def source():
         return VecNormalize(make_vec_env(pendulum, seed=3))
@@ -457,6 +488,7 @@ def test_other_action_bounds_are_pointed_out():
         (0.1, {"ent_coef": 0.5}, 0.5),
         (0.1, {"ent_coef": "auto"}, 0.1),
         (0.1, {}, 0.1),
+        (0.0, {"ent_coef": "auto_0.2"}, 0.2),
         ("auto_0.03", {"ent_coef": "auto_0.5"}, 0.5),
         ("auto_0.03", {"ent_coef": "auto"}, 0.03),
         ("auto_0.03", {"ent_coef": 0.2}, 0.2),

@@ -93,3 +93,17 @@ def test_what_fits_is_not_doubted():
         warnings.filterwarnings("error", message="after the fit")
         made = model(shifted()).learn(45, source_timesteps=0)
     assert made._judged_target
+
+
+def test_another_cart_pole_as_source_is_told(tmp_path):
+    def cartpole(**constants):
+        return gym.make("rpto/ContinuousCartPole-v0", **constants)
+
+    settings = {"dynamics": "physical", "declared": ["pole_length"], "policy_kwargs": {"net_arch": [4]}}
+    rpto = RPTO("MlpPolicy", cartpole(), target_env=cartpole(pole_length=1.5), device="cpu", **settings)
+    rpto.set_env(cartpole())
+    with pytest.warns(UserWarning, match=r"another model than the one that phi was fitted for \(pole_length differ"):
+        rpto.set_env(cartpole(pole_length=0.6))
+    rpto.save(tmp_path / "m.zip")
+    with pytest.warns(UserWarning, match=r"\(gravity differ"):
+        RPTO.load(tmp_path / "m.zip", cartpole(gravity=20.0))

@@ -119,6 +119,14 @@ def test_a_checkpoint_keeps_the_blocks(tmp_path):
     assert loaded.distance.__self__.blocks[0].actor.keys() == model.actor.state_dict().keys()
 
 
+def test_another_target_has_no_blocks_yet():
+    model = small(PDML, block_steps=20).learn(50, source_timesteps=0)
+    with pytest.warns(UserWarning, match="D_target loses 50 transitions"):
+        model.set_target_env(pendulum(13.0))
+    assert model.blocks == []
+    np.testing.assert_allclose(model.row_weights(5), 0.2)
+
+
 def test_what_it_cannot_do_is_refused():
     with pytest.raises(ValueError, match="newest_share"):
         PDML("MlpPolicy", pendulum(), newest_share=1.0)

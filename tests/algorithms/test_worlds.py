@@ -16,6 +16,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sb3_rpto import RPO, RPTO
+from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.factory import preset_section
 from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.effects import declare
@@ -153,6 +154,17 @@ def test_a_source_whose_vec_env_changes_observations_is_not_compared() -> None:
     source = VecFrameStack(DummyVecEnv([pendulum]), 2)
     target = VecFrameStack(DummyVecEnv([lambda: pendulum(12.0)]), 2)
     assert small(RPO, source, target).learn(30, source_timesteps=50).num_timesteps == 30
+
+
+def test_an_episodes_end_below_a_frame_stack_is_had_from_the_normalised_one() -> None:
+    def short() -> gym.Env:
+        return gym.wrappers.TimeLimit(pendulum().unwrapped, 10)
+
+    source = VecNormalize(VecFrameStack(DummyVecEnv([short]), 2))
+    target = VecFrameStack(DummyVecEnv([short]), 2)
+    model = small(RPO, source, target).learn(30, source_timesteps=50)
+    ends = chronological(model.replay_buffer.target)["next_observations"].reshape(30, -1)[9::10]
+    np.testing.assert_allclose(np.hypot(*ends.T[3:5]), 1.0, atol=1e-4)  # cosine and sine of the newest frame
 
 
 # ---------------------------------------------------------------------- what is carried over, and what is not

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import RescaleAction, TimeLimit, TransformObservation, TransformReward
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -18,6 +18,26 @@ from sb3_rpto.dynamics.cartpole import DECLARABLE, MAX_TRANSITIONS, CartPoleDyna
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
 
 SOURCE = ContinuousCartPoleEnv()
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda env: RescaleAction(env, np.float32(-0.5), np.float32(0.5)),
+        lambda env: TransformObservation(env, lambda seen: 2 * seen, env.observation_space),
+        lambda env: TransformReward(env, lambda reward: reward - 5),
+    ],
+)
+def test_the_equations_know_nothing_of_wrappers(wrap):
+    env = wrap(ContinuousCartPoleEnv())
+    for source in (env, DummyVecEnv([lambda: env])):
+        with pytest.raises(ValueError, match=f"wrapper.s. {type(env).__name__} may change .* dynamics='ensemble'"):
+            cartpole_constants(source)
+
+
+def test_cart_poles_of_different_constants_are_refused():
+    with pytest.raises(ValueError, match="cart-poles with different constants"):
+        cartpole_constants(DummyVecEnv([ContinuousCartPoleEnv, lambda: ContinuousCartPoleEnv(gravity=20.0)]))
 
 
 def collect(n: int = 500, seed: int = 0, **constants: float) -> Transitions:

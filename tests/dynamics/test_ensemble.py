@@ -258,10 +258,24 @@ def test_scaler_is_kept_after_the_first_fit():
 def test_holdout_is_permanent(n, more, cap, ratio):
     model = make(hidden=(4,), max_holdout=cap, holdout_ratio=ratio)
     first, later = model.holdout_mask(n), model.holdout_mask(n + more)
-    assert th.equal(first, later[:n])
+    assert not (later[:n] & ~first).any()  # what was trained on never judges
+    assert th.equal(first, later[:n]) or int(later.sum()) == cap  # and what judged goes on, but for the cap
     assert 1 <= int(first.sum()) <= cap
     assert not first.all()
     assert abs(int(first.sum()) - min(cap, ratio * n)) < 5
+
+
+def test_holdout_judges_the_newest_data_as_the_oldest():
+    shares = make(hidden=(4,)).holdout_mask(100_000).reshape(10, -1).sum(1)
+    assert int(shares.sum()) == 5_000
+    assert (shares - 500).abs().max() < 10
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int64])
+def test_whole_numbers_are_refused(kind):
+    whole = spaces.Box(0, 100, (2,), kind)
+    with pytest.raises(ValueError, match=r"observation_space holds u?int\d+, and .*DtypeObservation"):
+        EnsembleDynamics(whole, spaces.Box(-1, 1, (1,)))
 
 
 def test_holdout_is_not_trained_on():

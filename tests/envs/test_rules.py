@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
@@ -225,6 +226,58 @@ def test_wrappers_that_change_data_take_the_rules_with_them():
     assert rescaled.reward_fn is None
     assert rescaled.termination_fn is not None
     assert task_rules(VecFrameStack(make_vec_env("Pendulum-v1"), 2)) == TaskRules(None, None)
+
+
+class Bonus(gym.Wrapper):
+    def step(self, action):
+        observation, reward, *rest = self.env.step(action)
+        return observation, reward + 10, *rest
+
+
+def test_a_wrapper_that_steps_in_its_own_way_takes_the_environments_own_rules():
+    assert task_rules(Bonus(OwnRules())) == TaskRules(None, None)
+    assert task_rules(gym.wrappers.NormalizeReward(OwnRules())) == TaskRules(None, None)
+    gym.register("BonusElsewhere-v0", entry_point=f"{__name__}:OwnRules", max_episode_steps=5)
+    remote = SubprocVecEnv([lambda: Bonus(gym.make("BonusElsewhere-v0"))], start_method="fork")
+    try:
+        assert task_rules(remote) == TaskRules(None, None)
+    finally:
+        remote.close()
+
+
+def test_rules_of_a_wrapper_hold_for_what_is_outside_of_it():
+    class Ruled(Bonus):
+        def reward_fn(self, observations, actions, next_observations):
+            return next_observations[:, 0] + 10
+
+    rules = task_rules(gym.wrappers.TimeLimit(Ruled(OwnRules(2.0)), 10))
+    assert answers(rules)[0] == [11.5, 12.5, 10.0]
+    assert rules.termination_fn is None  # that of the environment is not Ruled's
+
+
+class Paid(PendulumEnv):
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        return observation, reward + 100, *rest
+
+
+class Renamed(PendulumEnv):
+    def render(self):
+        return None
+
+
+def test_somebodys_own_class_is_no_known_task_by_its_name():
+    for name, own, known in (("Pendulum-v7", Paid, False), ("Other-v7", Renamed, True), ("Hopper-v7", NoRules, False)):
+        gym.register(name, entry_point=own, max_episode_steps=5)
+        try:
+            assert (task_rules(gym.make(name)).termination_fn is not None) == known
+        finally:
+            del gym.registry[name]
+
+
+class NoRules(OwnRules):
+    reward_fn = termination_fn = None
+    _exclude_current_positions_from_observation, _terminate_when_unhealthy = True, False
 
 
 def test_a_function_of_that_name_that_is_no_rule_is_told_and_left():
