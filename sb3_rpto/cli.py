@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from sb3_rpto.commands import enjoy, plot, train, transfer
+from sb3_rpto.commands.options import check_file
 from sb3_rpto.version import __version__
 
 if TYPE_CHECKING:
@@ -163,6 +164,9 @@ def _trace(parsed: argparse.Namespace) -> int:
         raise ValueError(f"--horizon is {parsed.horizon:g}; give a time in s above 0")
     if parsed.calibrate < 0:
         raise ValueError(f"--calibrate is {parsed.calibrate}; give a number of data sets, or 0 for none")
+    check_file(parsed.known, "--known")
+    if parsed.out.exists() and not parsed.out.is_dir():
+        raise ValueError(f"--out {parsed.out} is a file; give a folder")
     model = _model(parsed.model)
     if overwrites(parsed.out, model):
         raise ValueError(

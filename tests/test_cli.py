@@ -69,6 +69,14 @@ def test_effects_are_known_from_a_file(files: Path, capsys: pytest.CaptureFixtur
     known.write_text("verdict: complete")
     assert run(files, "--known", str(known)) == 2
     assert "does not describe effects; give the effects.json of an earlier trace" in error(capsys)
+    assert run(files, "--known", str(files / "none.json")) == 2
+    assert "--known: there is no file" in error(capsys)
+
+
+def test_a_file_is_no_folder_to_write_to(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (files / "report").write_text("mine")
+    assert run(files, "--out", str(files / "report")) == 2
+    assert "is a file; give a folder" in error(capsys)
 
 
 def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixture[str]) -> None:

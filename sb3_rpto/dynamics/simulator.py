@@ -5,20 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
-import mujoco
-import numpy as np
 from gymnasium.wrappers import ClipAction
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.model import differing, load_model
-from sb3_rpto.effects.simulation import quiet
 from sb3_rpto.effects.wrapper import beyond_model
 from sb3_rpto.envs.observations import env_name, layers, mujoco_model, single_env, state_map
-from sb3_rpto.envs.state import copy_env
-
-#: Episodes whose first step is compared with MuJoCo alone.
-TRIED = 3
+from sb3_rpto.envs.steps import odd_step
 
 
 def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
@@ -89,36 +83,15 @@ def check_alike(env: gym.Env | VecEnv) -> None:
 def check_step(env: gym.Env, frame_skip: int) -> None:
     """Require that a step of the environment is the simulation of its action, and nothing else.
 
-    A task that scales actions in ``step()``, say, would have its scaling counted as error of the model. A copy is
-    stepped by random actions and compared with MuJoCo alone. What cannot be copied is refused later.
+    A task that scales actions in ``step()``, say, would have its scaling counted as error of the model. What cannot
+    be copied is refused later.
 
     :param env: a MuJoCo environment with all its wrappers; untouched
     :param frame_skip: simulation steps in one step of it
     :raises ValueError: other commands or another motion
     """
-    twin = copy_env(env)
-    if twin is None:
-        return
-    base: Any = twin.unwrapped
-    twin.action_space.seed(0)
-    limited = base.model.actuator_ctrllimited.astype(bool)[:, None]
-    low, high = np.where(limited, base.model.actuator_ctrlrange, (-np.inf, np.inf)).T
-    for seed in range(TRIED):
-        twin.reset(seed=seed)
-        action = twin.action_space.sample()
-        commands = np.clip(action, low, high)
-        alone = mujoco.MjData(base.model)
-        mujoco.mj_copyData(alone, base.model, base.data)
-        alone.ctrl[:] = commands
-        with quiet():
-            mujoco.mj_step(base.model, alone, nstep=frame_skip)
-            twin.step(action)
-        if not np.allclose(np.clip(base.data.ctrl, low, high), commands):
-            found = f"gives the commands {base.data.ctrl} where the action is {action}"
-        elif not (np.allclose(base.data.qpos, alone.qpos) and np.allclose(base.data.qvel, alone.qvel)):
-            found = "moves otherwise than MuJoCo under the same command"
-        else:
-            continue
+    found = odd_step(env, frame_skip)
+    if found is not None:
         raise ValueError(
             f"{env_name(env)}: step() {found}, and phi would make up for what step() adds; let actions be the "
             "commands of the actuators, and forces part of the MJCF or an effect (dynamics_kwargs={'effects': [...]})"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 import mujoco
 import numpy as np
@@ -13,6 +13,8 @@ from sb3_rpto.effects.names import SCALAR_JOINTS, near, object_id, object_names
 from sb3_rpto.effects.world import World
 
 Place = Literal["joint", "actuator", "body", "geom", "world", "sensor"]
+#: What an effect acts by; it overrides at least one.
+HOOKS = ("write", "act", "command", "observe", "late")
 
 
 @dataclass(frozen=True)
@@ -212,14 +214,24 @@ LIBRARY: dict[str, type[Effect]] = {}
 def register(effect: type[Effect]) -> type[Effect]:
     """Class decorator: add an effect to the library, so that :func:`sb3_rpto.tracing.trace` looks for it.
 
-    :raises ValueError: the class lacks an attribute, or another effect has its kind
+    :raises ValueError: the class lacks an attribute, one does not fit, it overrides no hook, or another effect has its
+        kind
     """
     for attribute in ("kind", "place", "parameters", "equation"):
         if not hasattr(effect, attribute):
             raise ValueError(f"{effect.__name__} needs a class attribute {attribute!r}; see Effect")
     known = LIBRARY.get(effect.kind)
-    if known is not None and known.__qualname__ != effect.__qualname__:
-        raise ValueError(f"there is an effect {effect.kind!r} already ({known.__qualname__}); choose another kind")
+    names = [(cls.__module__, cls.__qualname__) for cls in (known, effect) if cls is not None]
+    if len({*names}) > 1:  # a class that is defined again, as in a notebook, takes the place of the old one
+        raise ValueError(f"there is an effect {effect.kind!r} already ({'.'.join(names[0])}); choose another kind")
+    if not (isinstance(effect.kind, str) and effect.kind.isidentifier()):
+        raise ValueError(f"{effect.__name__}: kind is {effect.kind!r}; give a name of letters, digits and underscores")
+    if effect.place not in get_args(Place):
+        raise ValueError(f"{effect.__name__}: place is {effect.place!r}; choose one of {', '.join(get_args(Place))}")
+    if not effect.parameters or not all(isinstance(p, Parameter) for p in effect.parameters):
+        raise ValueError(f"{effect.__name__}: parameters is {effect.parameters!r}; give a tuple of Parameter")
+    if all(getattr(effect, hook) is getattr(Effect, hook) for hook in HOOKS):
+        raise ValueError(f"{effect.__name__} does nothing; override one of {', '.join(HOOKS)}")
     LIBRARY[effect.kind] = effect
     return effect
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -180,13 +181,19 @@ def state_map(env: gym.Env) -> StateMap:
     make = _registered.get(env.spec.id if env.spec is not None else "")
     if make is None:
         make = next((_registered[cls] for cls in type(base).__mro__ if cls in _registered), None)
+    strange = next((layer for layer in layers(env)[:-1] if not leaves_observations(layer)), None)
+    if make is not None and strange is not None:
+        warnings.warn(
+            f"{name}: its registered state map is taken to know what the wrapper {type(strange).__name__} makes of the "
+            "observations; give the environment without it where it does not",
+            stacklevel=2,
+        )
     if make is None:
-        for layer in layers(env)[:-1]:
-            if not leaves_observations(layer):
-                raise ValueError(
-                    f"{name}: what the wrapper {type(layer).__name__} makes of the observations is not known; give the "
-                    "environment without it where it leaves them as they are, else use register_state_map"
-                )
+        if strange is not None:
+            raise ValueError(
+                f"{name}: what the wrapper {type(strange).__name__} makes of the observations is not known; give the "
+                "environment without it where it leaves them as they are, else use register_state_map"
+            )
         # Whoever wrote _get_obs decides on the layout, however deep a class is derived.
         author = next((cls for cls in type(base).__mro__ if "_get_obs" in vars(cls)), object)
         known = author.__module__.startswith("gymnasium.envs.mujoco.")

@@ -104,7 +104,8 @@ def read_columns(names: Iterable[str], file: str) -> Columns:
                 f"{file}: joint {joint!r} has {len(qpos)} qpos and {len(qvel)} qvel columns; "
                 f"give 'qpos.{joint}' for a scalar joint, "
                 f"4 and 3 numbered ones ('qpos.{joint}.0' …) for a ball joint, 7 and 6 for a free joint, or "
-                "leave out all its velocities"
+                "leave out all its velocities (a name that ends in a dot and a digit is a coordinate's: rename a "
+                "joint that is called so)"
             )
         velocities += qvel
     for prefix, known in (("qvel", velocities), ("qfrc", velocities), ("enabled", found["ctrl"])):
@@ -124,6 +125,8 @@ def _coordinates(joint: str, names: list[str]) -> list[str]:
 
 
 def _near(name: str) -> str:
+    if name == "" or name.startswith("Unnamed"):
+        return "an index that was saved with the table? Write it without one (pandas: index=False)"
     for prefix in PREFIXES:
         if name.startswith(prefix) and len(name) > len(prefix) + 1 and not name[len(prefix)].isalnum():
             return f"did you mean '{prefix}.{name[len(prefix) + 1 :]}'?"

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 
@@ -13,6 +14,7 @@ from sb3_rpto.effects import LIBRARY, Declared, Effect, Scales, Simulation
 from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.library import given
 from sb3_rpto.effects.model import load_model
+from sb3_rpto.envs.steps import odd_step
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.contacts import OFTEN, contact_changes
 from sb3_rpto.tracing.measurements import Measurements
@@ -22,7 +24,7 @@ from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.search import Selectors
 from sb3_rpto.tracing.select import Selector
 from sb3_rpto.tracing.turns import settle_turns
-from sb3_rpto.tracing.windows import Windows, cut, discretised, noise_levels
+from sb3_rpto.tracing.windows import BLOCK, Windows, cut, discretised, noise_levels
 
 #: Most windows to fit, and to select on.
 TRAIN, SELECT = 40, 40
@@ -100,6 +102,21 @@ class SetUp:
         return windows(model, self.train, self.select, self.sigma, horizon, 1 - self.length / horizon)
 
 
+def _own_step(model: Any) -> list[Finding]:
+    """An environment that does more in ``step()`` than simulate: only its MJCF is compared with the data."""
+    base: Any = model.unwrapped if isinstance(model, gym.Env) else None
+    if base is None or base.action_space.shape != (base.model.nu,):
+        return []
+    found = odd_step(base, int(getattr(base, "frame_skip", 1)))
+    if found is None:
+        return []
+    message = (
+        f"{found}. The MJCF alone is compared with the data: what step() adds is named as missing where the data show "
+        "it, and is there twice in a corrected environment. Make it part of the MJCF or an effect, or leave it out"
+    )
+    return [Finding("own step", "step() of the environment", message)]
+
+
 def prepare(
     model: Any,
     data: Measurements,
@@ -118,7 +135,7 @@ def prepare(
     spec, compiled = load_model(model)
     data = replace(data, simulated=data.simulated or simulated)
     data, turned = settle_turns(compiled, data)
-    findings = [*data.findings, *turned, *check_against(compiled, data)]
+    findings = [*data.findings, *turned, *check_against(compiled, data), *_own_step(model)]
     given(compiled, declared, known)  # what is wrong there is said before the work
     train, select, test = data.split(seed)
     findings += [f for f in train.findings if f not in findings]
@@ -242,8 +259,9 @@ def windows(
         every = cut(model, train, sigma, horizon, 2 * FEW, overlap=OVERLAP)
     # Some hundred transitions of a simulator are soon over, and tell much.
     if (few or not train.whole_states) and len(np.unique(every.block)) < 3:
+        enough = sum(float(np.ptp(e.time)) for e in train.episodes) > 2 * BLOCK  # for a third block to begin
         raise ValueError(
             f"the training runs hold {len(every)} window(s) of {horizon:g} s in fewer than three blocks of a "
-            "second: too few to select on; record longer, or lower horizon"
+            f"second: too few to select on; record longer{', or lower horizon' if enough else ''}"
         )
     return every, None

@@ -17,7 +17,7 @@ from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE, Adequacy
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.concentrate import NOTHING
-from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
+from sb3_rpto.tracing.evaluate import horizon_errors, missed, noise_floor
 from sb3_rpto.tracing.identify import Loss, Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.model_checks import doubts
@@ -132,7 +132,10 @@ def trace(
     residuals_after = [] if tied else force_residuals(simulation, final, data)
     unknown = np.full(simulation.model.nv, np.nan)  # where all runs are too short to differentiate
     verdict = judge(found.before, found.after, bool(selection.model.effects))
-    if verdict not in SETTLED:
+    floor = noise_floor(simulation, final, data, sigma, seed)
+    if verdict in SETTLED:
+        findings += missed(errors_after, floor, sorted({e.run for e in data.episodes}))
+    else:
         findings += doubts(set_up.nominal, fitted) + _early(found, fitted)
     findings += _undetermined(problem, final, intervals) + _at_bounds(problem, final)
     findings += _strays(selector, final, set_up, seed)
@@ -149,7 +152,7 @@ def trace(
         adequacy_after=found.after,
         before=horizon_errors(simulation, before.values, data, sigma, seed),
         after=errors_after,
-        floor=noise_floor(simulation, final, data, sigma, seed),
+        floor=floor,
         force_before=summary(residuals_before) if residuals_before else unknown,
         force_after=summary(residuals_after) if residuals_after else unknown,
         learnable=learnable_share(residuals_after, seed) if residuals_after else unknown,
@@ -377,8 +380,8 @@ def _check_arguments(
     if horizon is not None and not (isinstance(horizon, float | int) and 0 < horizon < np.inf):
         raise ValueError(f"horizon is {horizon!r}; give a time in s above 0, or None")
     for name, value in (("seed", seed), ("calibrate", calibrate), ("threads", threads)):
-        if value < 0:
-            raise ValueError(f"{name} is {value}; give a number from 0")
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 0:
+            raise ValueError(f"{name} is {value!r}; give a whole number from 0")
 
 
 def _declared(simulation: Simulation, values: np.ndarray, intervals: np.ndarray) -> list[Traced]:

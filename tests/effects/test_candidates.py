@@ -191,6 +191,25 @@ def test_a_users_effect_is_offered_and_acts(cubic: type[Effect]) -> None:
     assert from_json(cubic("slide", c=0.5).to_json()).values == [0.5]
 
 
+@pytest.mark.parametrize(
+    ("attribute", "wrong", "message"),
+    [
+        ("kind", "", "kind is ''; give a name"),
+        ("place", "link", "place is 'link'; choose one of joint, actuator, body"),
+        ("parameters", (), r"parameters is \(\); give a tuple of Parameter"),
+        ("parameters", ("a",), "give a tuple of Parameter"),
+        ("act", Effect.act, "Ticking does nothing; override one of write, act"),
+    ],
+)
+def test_a_class_that_would_fail_in_the_middle_of_a_trace_is_refused(
+    cubic: type[Effect], attribute: str, wrong: object, message: str
+) -> None:
+    right = {**{name: vars(cubic)[name] for name in ("place", "parameters", "equation", "act")}, "kind": "ticking"}
+    with pytest.raises(ValueError, match=message):
+        register(type("Ticking", (Effect,), {**right, attribute: wrong}))
+    assert "ticking" not in LIBRARY
+
+
 def test_registering_is_checked(cubic: type[Effect]) -> None:
     with pytest.raises(ValueError, match="Half needs a class attribute 'parameters'"):
 
@@ -207,6 +226,12 @@ def test_registering_is_checked(cubic: type[Effect]) -> None:
             place = "joint"
             parameters = ()
             equation = ""
+
+    with pytest.raises(ValueError, match=r"there is an effect 'coulomb_friction' already \(sb3_rpto\."):
+
+        @register
+        class CoulombFriction(LIBRARY["coulomb_friction"]):
+            """Of the same name, in another module."""
 
     assert LIBRARY["cubic_drag"] is cubic
     with pytest.raises(ValueError, match="no effect 'cubic_drg' is registered; did you mean 'cubic_drag'"):

@@ -169,6 +169,8 @@ def test_users_register_their_own(key, monkeypatch):
     states = state_map(env)(observations)
     np.testing.assert_allclose(states.qpos[:, 1:], qpos[:, 1:])
     np.testing.assert_allclose(states.qvel, qvel)
+    with pytest.warns(UserWarning, match="its registered state map is taken to know what the wrapper Normalize"):
+        state_map(gym.wrappers.NormalizeObservation(env))
 
 
 def test_a_registered_map_of_wrong_shape_is_refused(monkeypatch):

@@ -102,6 +102,8 @@ def test_free_joint_has_seven_and_six_columns():
     with pytest.raises(ValueError, match="7 and 6 for a free joint, or leave out all its velocities"):
         read_columns(names[:-1], "a")
     assert read_columns(names[:8], "a").missing == columns.qvel
+    with pytest.raises(ValueError, match="ends in a dot and a digit is a coordinate's: rename a joint"):
+        read_columns(["time", "qpos.j.1"], "a")
 
 
 def edited(**changes):
@@ -126,6 +128,7 @@ def planted(value, row=7, column="qpos.hinge"):
     [
         (edited(qpso__hinge=np.zeros(200)), r"a: unknown column 'qpso.hinge'; did you mean 'qpos.hinge'"),
         (edited(zzz=np.zeros(200)), r"unknown column 'zzz'; columns are"),
+        ({"": np.arange(200), **swing()}, r"unknown column ''; an index .*index=False"),
         (edited(time=None), r"no column 'time'"),
         (edited(qpos__hinge=None, qvel__hinge=None), r"no column 'qpos.<joint>'"),
         (edited(qpos__hinge=None, qpos__arm=np.zeros(200)), r"'qvel.hinge' has no 'qpos.hinge'"),

@@ -12,6 +12,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco.inverted_double_pendulum_v5 import InvertedDoublePendulumEnv
 from simulated import PENDULUM, RATE, WITH_WHEEL, briefly, compiled, recorded
 from stable_baselines3.common.buffers import ReplayBuffer
 
@@ -113,6 +114,18 @@ def test_a_run_that_stalled_is_named_also_where_others_are_judged_on() -> None:
     assert stray.where == "run 0"
     assert stray.message.startswith("5 of 5 windows")
     assert report.effects[0].interval[0, 0] < 0.08 < report.effects[0].interval[1, 0]
+
+
+def test_a_test_run_unlike_all_others_is_told_beside_the_verdict() -> None:
+    data = simple()
+    runs = simple_report().runs["test"]
+    moved = [replace(e, qpos=e.qpos + 0.06) if e.run in runs else e for e in data.episodes]
+    report = traced_simply(replace(data, episodes=moved))
+    assert report.verdict == simple_report().verdict == "explained"
+    (found,) = [f for f in report.findings if f.kind == "missed"]
+    assert found.where == ", ".join(runs)
+    assert "times what noise leaves" in found.message
+    assert not [f for f in simple_report().findings if f.kind == "missed"]
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -245,6 +258,7 @@ def test_a_single_block_to_select_on_is_no_evidence_so_that_all_take_turns() -> 
 def test_a_single_run_is_traced_and_reported_as_not_held_out() -> None:
     report = traced_simply(few(1, 3.6))
     assert report.runs["test"] == []
+    assert not [f for f in report.findings if f.kind == "missed"]
     assert any("no test data" in f.message for f in report.findings)
     assert "fitted runs" in str(report)
     assert np.isfinite(report.after[0].rmse).all()
@@ -252,8 +266,10 @@ def test_a_single_run_is_traced_and_reported_as_not_held_out() -> None:
 
 
 def test_a_run_too_short_to_be_parted_into_blocks_is_refused() -> None:
-    with pytest.raises(ValueError, match="too few to select on; record longer"):
+    with pytest.raises(ValueError, match=r"too few to select on; record longer$"):
         traced_simply(few(1, 2.0), horizon=None)
+    with pytest.raises(ValueError, match=r"record longer, or lower horizon$"):
+        traced_simply(few(1, 2.3), horizon=1.0)
 
 
 def test_many_short_windows_of_a_single_second_are_refused_too() -> None:
@@ -374,6 +390,34 @@ def test_dry_friction_that_an_environment_lacks_is_found() -> None:
     corrected = report.apply(env)
     assert corrected.unwrapped.model.dof_frictionloss[0] == pytest.approx(1.0, rel=0.1)
     assert env.unwrapped.model.dof_frictionloss[0] == 0
+
+
+class Steps(InvertedDoublePendulumEnv):
+    """One whose step does more than simulate."""
+
+    gain, push = 2.0, 0.0
+
+    def step(self, action):
+        self.data.qfrc_applied[0] = self.push
+        return super().step(self.gain * action)
+
+
+@pytest.mark.parametrize(("gain", "push", "said"), [(2.0, 0.0, "gives the commands"), (1.0, 3.0, "moves otherwise")])
+def test_an_environment_that_does_more_than_its_model_is_told(gain: float, push: float, said: str) -> None:
+    _, data = driven(0.0)
+    env = Steps()
+    env.gain, env.push = gain, push
+    report = trace(env, data, candidates=[], threads=1)
+    (found,) = [f for f in report.findings if f.kind == "own step"]
+    assert said in found.message
+    assert not [f for f in trace(driven(0.0)[0], data, candidates=[], threads=1).findings if f.kind == "own step"]
+
+
+@pytest.mark.parametrize("name", ["seed", "calibrate", "threads"])
+@pytest.mark.parametrize("wrong", [1.5, True, -1])
+def test_what_is_no_whole_number_is_refused(name: str, wrong: Any) -> None:
+    with pytest.raises(ValueError, match=f"{name} is .*; give a whole number from 0"):
+        trace(COARSE, simple(), **{name: wrong})
 
 
 def test_how_test_runs_were_sampled_changes_nothing_of_the_fit() -> None:
