@@ -14,6 +14,7 @@ from sb3_rpto.effects import LIBRARY, Declared, Effect, Scales, Simulation
 from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.library import given
 from sb3_rpto.effects.model import load_model
+from sb3_rpto.effects.trial import try_out
 from sb3_rpto.envs.steps import odd_step
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.contacts import OFTEN, contact_changes
@@ -179,6 +180,9 @@ def prepare(
             column = f"param.{settings[one.number]}"
             raise ValueError(f"declared {one.label!r} is the column {column!r} of the data, too; leave one of them out")
     effects = [*there, *_candidates(nominal, there, kinds)]
+    for effect in effects:
+        if not type(effect).__module__.startswith("sb3_rpto."):
+            try_out(nominal, effect)
     fine = Simulation(nominal, effects, threads)
     scales = typical(fine, force_residuals(fine, fine.null, fitted)).scales(effects)
     rough = Simulation(discretised(compiled, fitted, fine=False), effects, threads)

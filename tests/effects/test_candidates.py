@@ -19,6 +19,7 @@ from sb3_rpto.effects import (
     from_json,
     register,
 )
+from sb3_rpto.effects.trial import try_out
 
 XML = """
 <mujoco>
@@ -208,6 +209,25 @@ def test_a_class_that_would_fail_in_the_middle_of_a_trace_is_refused(
     with pytest.raises(ValueError, match=message):
         register(type("Ticking", (Effect,), {**right, attribute: wrong}))
     assert "ticking" not in LIBRARY
+
+
+@pytest.mark.parametrize("hook", ["act", "command", "observe", "late"])
+def test_a_hook_that_fails_is_named_before_a_search(hook: str) -> None:
+    def wrong(self, *arguments):
+        raise IndexError("too many indices")
+
+    place = {"act": "joint", "command": "actuator"}.get(hook, "sensor")
+    strength = (Parameter("strength", "N·m", 0.1),)
+    own = type("Wrong", (Effect,), dict(kind="wrong", place=place, parameters=strength, equation="", **{hook: wrong}))
+    compiled = model()
+    with pytest.raises(ValueError, match=rf"wrong\(\w+\): {hook} of Wrong fails on 3 .*IndexError: too many indices"):
+        try_out(compiled, own(own.places(compiled)[0]))
+
+
+def test_effects_of_the_library_pass() -> None:
+    compiled = model()
+    for effect in candidates(compiled):
+        try_out(compiled, effect)
 
 
 def test_registering_is_checked(cubic: type[Effect]) -> None:
