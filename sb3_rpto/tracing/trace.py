@@ -134,7 +134,7 @@ def trace(
     verdict = judge(found.before, found.after, bool(selection.model.effects))
     floor = noise_floor(simulation, final, data, sigma, seed)
     if verdict in SETTLED:
-        findings += missed(errors_after, floor, sorted({e.run for e in data.episodes}))
+        findings += missed(errors_after, floor, sorted({e.run for e in set_up.test.episodes}))
     else:
         findings += doubts(set_up.nominal, fitted) + _early(found, fitted)
     findings += _undetermined(problem, final, intervals) + _at_bounds(problem, final)
