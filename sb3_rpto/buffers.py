@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import BaseBuffer, DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.save_util import load_from_pkl
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
@@ -63,6 +63,8 @@ class DualReplayBuffer(ReplayBuffer):
                 "optimize_memory_usage=True stores trajectories only, the source side also holds one-step branches; "
                 "leave it False and lower buffer_size to save memory"
             )
+        if not isinstance(target_size, int | np.integer) or target_size < 1:
+            raise ValueError(f"target_size must be a positive integer, got {target_size!r}")
         kwargs = {"handle_timeout_termination": handle_timeout_termination, **(side_kwargs or {})}
         self._make_side = partial(side_class, observation_space=observation_space, action_space=action_space, **kwargs)
         self.source = self._make_side(buffer_size=buffer_size, device=device)
@@ -244,6 +246,11 @@ def load_transitions(
         buffer = data if isinstance(data, ReplayBuffer) else load_from_pkl(data)
         if not isinstance(buffer, ReplayBuffer):
             raise ValueError(f"expected an SB3 ReplayBuffer, its pickle or an .npz file, got {type(buffer).__name__}")
+        if isinstance(buffer, DictReplayBuffer):
+            raise ValueError(
+                f"a {type(buffer).__name__} holds Dict observations; record with "
+                "gymnasium.wrappers.FlattenObservation around the environment, in a ReplayBuffer"
+            )
         arrays = chronological(buffer.side(world) if isinstance(buffer, DualReplayBuffer) else buffer)
     if len(arrays["observations"]) == 0:
         raise ValueError("the transitions to load are empty")

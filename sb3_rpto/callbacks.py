@@ -59,7 +59,7 @@ class RelativityGapCallback(TransferCallback):
     :param n_episodes: newest whole episodes of each world to estimate from; fewer are closer to the current policy,
         more have a smaller standard error
     :param verbose: as in SB3
-    :raises ValueError: for a number below 1
+    :raises ValueError: for a number below 1; at the start of training for gamma = 1, where the sums have no end
     """
 
     def __init__(self, frequency: int = 1_000, n_episodes: int = 10, verbose: int = 0) -> None:
@@ -71,6 +71,11 @@ class RelativityGapCallback(TransferCallback):
         self.n_episodes = n_episodes
         self._n_due = 0
         self._old: tuple[dict[str, Any], SACPolicy] | None = None
+
+    def _init_callback(self) -> None:
+        super()._init_callback()
+        if self.model.gamma >= 1:
+            raise ValueError(f"{type(self).__name__} needs gamma below 1, the model's is {self.model.gamma}")
 
     def _on_training_start(self) -> None:
         self._n_due = self.num_timesteps // self.frequency

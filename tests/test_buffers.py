@@ -7,7 +7,7 @@ import torch as th
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
 from sb3_rpto.buffers import DualReplayBuffer, chronological, load_transitions
 
@@ -160,6 +160,9 @@ def test_load_transitions_refuses_what_it_cannot_use(tmp_path):
         load_transitions(tmp_path / "other.npz")
     with pytest.raises(ValueError, match="empty"):
         load_transitions(ReplayBuffer(10, OBS, ACT, device="cpu"))
+    nested = DictReplayBuffer(10, spaces.Dict({"a": OBS}), ACT, device="cpu")
+    with pytest.raises(ValueError, match=r"DictReplayBuffer holds Dict observations; .*FlattenObservation"):
+        load_transitions(nested)
     bad = DualReplayBuffer(10, OBS, ACT, device="cpu")
     data = rows(0, 3)
     data["rewards"][1] = np.nan

@@ -286,6 +286,13 @@ def test_numbers_below_one_are_refused(name):
         RelativityGapCallback(**{name: 0})
 
 
+def test_endless_sums_are_refused_before_the_first_target_step():
+    model = small(RPO, world(0.8), world(0.7), gamma=1.0)
+    with pytest.raises(ValueError, match="needs gamma below 1"):
+        model.learn(10, RelativityGapCallback(5), source_timesteps=0)
+    assert model.target_spent == {}
+
+
 @pytest.mark.parametrize("callback", [RelativityGapCallback, KeepBest])
 def test_other_algorithms_are_refused(callback):
     with pytest.raises(TypeError, match="needs RPO, RTO or RPTO, got SAC"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from numbers import Integral
@@ -44,7 +45,7 @@ DYNAMICS_ARGUMENTS = frozenset(
 #: What :func:`check_values` looks at beside the name of the dynamics.
 CHECKED = (
     *("weighting", "rollout_start", "real_ratio", "weight_floor", "tau", "gamma", "source_steps", "model_train_freq"),
-    *("gradient_steps", "target_update_interval", "batch_size", "buffer_size"),
+    *("gradient_steps", "target_update_interval", "batch_size", "buffer_size", "train_freq"),
 )
 #: What stands for target steps in an offline run has no use for these.
 ONLINE = frozenset({"action_noise", "train_freq"})
@@ -156,6 +157,7 @@ def check_values(
     target_update_interval: Any,
     batch_size: Any,
     buffer_size: Any,
+    train_freq: Any,
 ) -> None:
     """Refuse names that do not exist and numbers out of range; arguments as those of the algorithms.
 
@@ -170,8 +172,8 @@ def check_values(
             raise ValueError(f"{name}={value!r} does not exist; choose one of {list(choices)}")
     if not 0 <= real_ratio < 1:
         raise ValueError(f"real_ratio must lie in [0, 1), got {real_ratio}")
-    if weight_floor < 0:
-        raise ValueError(f"weight_floor must not be negative, got {weight_floor}")
+    if not 0 <= weight_floor < math.inf:
+        raise ValueError(f"weight_floor must be a finite number and not negative, got {weight_floor}")
     if not 0 < tau <= 1:
         raise ValueError(f"tau must lie in (0, 1], got {tau!r}")
     if not 0 <= gamma <= 1:
@@ -184,6 +186,7 @@ def check_values(
         "target_update_interval": target_update_interval,
         "batch_size": batch_size,
         "buffer_size": buffer_size,
+        "train_freq": train_freq[0] if isinstance(train_freq, tuple) else train_freq,  # or (number, unit)
     }.items():
         if not _is_integer(value) or value < 1:
             raise ValueError(f"{name} must be a positive integer, got {value!r}")

@@ -339,11 +339,10 @@ class TwoWorlds(PolicySnapshots):
         infos: list[dict[str, Any]],
     ) -> None:
         """Store a target transition as SB3 does, after a look at it."""
-        check_finite("target", observation=np.asarray(new_obs), reward=reward)
-        for info in (info for info, done in zip(infos, dones) if done):  # new_obs is already that of the reset
-            check_finite("target", observation=np.asarray(info["terminal_observation"]))
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         assert self.target_env is not None
+        ended = [info["terminal_observation"] for info, done in zip(infos, dones) if done]  # new_obs is the reset's
+        find_ledger(self.target_env).check(np.asarray([*new_obs, *ended]), reward)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         if unwrap_vec_normalize(self.target_env) is not None:  # what SB3 stores is clipped then
             side = self.replay_buffer.target
             for i in np.flatnonzero(dones):
@@ -373,7 +372,7 @@ class TwoWorlds(PolicySnapshots):
         assert self.ep_info_buffer is not None
         count = min(RECENT_EPISODES, self._stats_window_size)
         recent = [info["r"] for info in list(self.ep_info_buffer)[-count:]]
-        if len(recent) == count:
+        if recent and len(recent) == count:
             self.keep_if_best(float(np.mean(recent)))
 
     def store_step(self, step: dict[str, Any]) -> None:

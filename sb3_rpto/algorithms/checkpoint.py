@@ -210,10 +210,8 @@ def resume(model: Resumable) -> None:
         return
     assert model.env is not None  # learn() has checked both worlds
     restarted = []
-    if not _put_back(model.env, state["source"]):
+    if not _put_source_back(model, state):
         restarted.append("source")
-    elif state["source_world"] is not None and model._source_world is not None:
-        model._source_world.set_state(state["source_world"])
     if not model._offline and state["last_obs"] is not None and not _put_target_back(model, state):
         restarted.append("target")
     if restarted:
@@ -243,6 +241,21 @@ def _restore_streams(state: dict[str, Any]) -> None:
     random.setstate(state["random"])
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
+
+
+def _put_source_back(model: Resumable, state: dict[str, Any]) -> bool:
+    """Restore the source and its episodes; False where new ones begin."""
+    assert model.env is not None  # learn() has checked
+    restored = _put_back(model.env, state["source"])
+    if not state["source_world"] or model._source_world is None:  # branches have no episodes
+        return restored or state["source_world"] == {}
+    if restored:
+        try:
+            model._source_world.set_state(state["source_world"])
+        except ValueError:  # another number of episodes side by side, or other simulators
+            model._source_world.begin_anew()
+            restored = False
+    return restored
 
 
 def _put_target_back(model: Resumable, state: dict[str, Any]) -> bool:

@@ -417,8 +417,6 @@ def renew_source(model: Looping) -> None:
 def learn_for_a_step(model: Looping) -> int:
     """Steps 3, 5 and 6 of a round with one target step, but for the fit; the number of source steps."""
     assert model._source_world is not None
-    if model.use_sde:
-        model.actor.reset_noise()
     taken = model._source_world.interact(model, int(model.source_steps))
     model.source_timesteps += taken
     model.train(model.updates_per_step, model.batch_size)

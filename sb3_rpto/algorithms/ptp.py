@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_rpto.algorithms.mbpo import MBPO
 from sb3_rpto.algorithms.regression import regress
-from sb3_rpto.algorithms.source import BranchSource, SourceWorld
+from sb3_rpto.algorithms.source import BranchSource, SourceWorld, sample_policy
 from sb3_rpto.algorithms.update import RelativeUpdate
 from sb3_rpto.dynamics.base import Prediction, Transitions
 
@@ -186,8 +186,7 @@ class PTP(MBPO):
 
     def act(self, observations: th.Tensor) -> th.Tensor:
         """Actions of the stochastic policy in the environment's units; raw observations (n, d) -> (n, action_dim)."""
-        with th.no_grad():
-            return self.unscale_actions(self.actor(self._normalised(observations)))
+        return self.unscale_actions(sample_policy(self, self._normalised(observations)))
 
     def _fit_to_transitions(self) -> None:
         super()._fit_to_transitions()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_rpto.algorithms.update import RelativeUpdate
@@ -105,11 +107,15 @@ class EpisodeSource(SourceWorld):
             self._last_raw = self._raw(self._last_obs)
         assert self._last_raw is not None  # it comes and goes with _last_obs
         model.policy.set_training_mode(False)
-        steps = 0
+        steps, held = 0, math.inf  # for how many steps gSDE's noise was held
         while steps < n_steps:
             if random:
                 actions = np.array([self.env.action_space.sample() for _ in range(self.env.num_envs)])
             else:
+                if model.use_sde and held >= _sde_hold(model):
+                    model.actor.reset_noise(self.env.num_envs)
+                    held = 0
+                held += 1
                 actions, _ = model.policy.predict(self._last_obs, deterministic=False)
             new_obs, rewards, dones, infos = self.env.step(actions)
             raw_obs, raw_next = self._last_raw, self._raw(new_obs)
@@ -254,8 +260,7 @@ class BranchSource(SourceWorld):
         normaliser = model.get_vec_normalize_env()
         seen = starts if normaliser is None else normaliser.normalize_obs(starts)
         model.policy.set_training_mode(False)
-        with th.no_grad():
-            scaled = model.actor(th.as_tensor(seen, device=model.device).float(), deterministic=False)
+        scaled = sample_policy(model, th.as_tensor(seen, device=model.device).float())
         actions = model.unscale_actions(scaled)
         answer = self.answer(model, th.as_tensor(starts, device=model.device), actions)
         next_obs, rewards = answer.next_observations.cpu().numpy(), answer.rewards.cpu().numpy()
@@ -286,3 +291,22 @@ class BranchSource(SourceWorld):
             rows = np.random.randint(len(buffer.source_starts), size=n - n_target)
             pools.append(buffer.source_starts[rows])
         return np.concatenate(pools)
+
+
+def sample_policy(model: RelativeUpdate, observations: th.Tensor) -> th.Tensor:
+    """Actions of the stochastic policy in [-1, 1], (n, action_dim), each with noise of its own under gSDE, too.
+
+    :param observations: as the policy sees them, (n, observation_dim)
+    """
+    if model.use_sde:
+        model.actor.reset_noise(len(observations))
+    with th.no_grad():
+        return model.policy._predict(observations, deterministic=False)
+
+
+def _sde_hold(model: RelativeUpdate) -> float:
+    """For how many steps gSDE's noise is held, as in the target: SB3 draws anew with each rollout, or more often."""
+    rollout = model.train_freq
+    assert isinstance(rollout, TrainFreq)  # an int until SB3's _setup_model
+    held = rollout.frequency if rollout.unit == TrainFrequencyUnit.STEP else math.inf
+    return min(held, model.sde_sample_freq if model.sde_sample_freq > 0 else math.inf)

@@ -392,8 +392,6 @@ class TransferAlgorithm(Looping):
         """Step 3: act in the source P_phi, ``source_steps`` times for each target step, and fill D_source."""
         if self.learns_at_fits():
             return
-        if self.use_sde:
-            self.actor.reset_noise()
         assert self._source_world is not None  # learn() has made it
         n_steps = self._collected * int(self.source_steps)
         if self._offline:  # the budget is one of source steps then

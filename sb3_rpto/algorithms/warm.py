@@ -279,6 +279,8 @@ def _checked(arrays: dict[str, np.ndarray], model: Resumable, name: str) -> dict
         raise ValueError(
             f"{name} holds actions outside [-1, 1]; scale them by policy.scale_action, as SB3's buffers do"
         )
+    if not np.isin(arrays["terminations"], (0, 1)).all():
+        raise ValueError(f"{name} holds values of done other than 0 and 1 (terminal, not a time limit); mend them")
     return arrays
 
 

@@ -56,6 +56,17 @@ class TargetLedger(VecEnvWrapper):
         self.disturbed = False
         self._left_at = whereabouts(self.venv)
 
+    def check(self, observations: np.ndarray, rewards: np.ndarray) -> None:
+        """Look at what the target answered; if it cannot be stored, its step and its episode are given up.
+
+        :raises ValueError: for what is not finite
+        """
+        try:
+            check_finite("target", observation=observations, reward=rewards)
+        except ValueError:
+            self.unstored, self.disturbed = False, True
+            raise
+
     def lost(self, warn: bool) -> bool:
         """Whether somebody's steps have ended the episode under way.
 

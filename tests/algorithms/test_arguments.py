@@ -30,6 +30,7 @@ VALUES = {
     "gamma": 1.0,
     "batch_size": 256,
     "buffer_size": 1_000,
+    "train_freq": (1, "step"),
 }
 
 

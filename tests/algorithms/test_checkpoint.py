@@ -3,6 +3,7 @@
 import contextlib
 import tempfile
 import threading
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -399,6 +400,40 @@ def test_a_world_that_cannot_restore_its_state_says_so(tmp_path):
         target.close()
 
 
+def test_a_source_of_branches_has_no_episode_to_restore(tmp_path):
+    source = SubprocVecEnv([pendulum])
+    try:
+        small(RPTO, source, learning_starts=0).learn(30, source_timesteps=0).save(tmp_path / "model.zip")
+        resumed = RPTO.load(tmp_path / "model.zip", env=source, target_env=pendulum(12.0))
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", message=".*cannot restore its state")
+            resumed.learn(10, reset_num_timesteps=False)
+    finally:
+        source.close()
+
+
+@pytest.mark.parametrize("make", [cartpole, double_pendulum])
+def test_another_number_of_episodes_side_by_side_begins_new_ones_and_loses_nothing(make, tmp_path):
+    class SaveAt(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 20:  # the step is taken and not yet stored
+                self.model.save(tmp_path / "model")
+                self.model.save_replay_buffer(tmp_path / "buffer")
+            return self.num_timesteps < 20
+
+    declared = ["pole_length"] if make is cartpole else ["pole.length"]
+    settings = {"dynamics": "physical", "declared": declared, "policy_kwargs": SMALL_POLICY, "gradient_steps": 1}
+    target = cartpole(pole_length=2.0) if make is cartpole else long_pole()
+    RPTO("MlpPolicy", make(), target_env=target, source_steps=4, seed=0, **settings).learn(
+        30, SaveAt(), source_timesteps=150
+    )
+    resumed = RPTO.load(tmp_path / "model", env=make(), target_env=target, source_steps=6, device="cpu")
+    resumed.load_replay_buffer(tmp_path / "buffer")
+    with pytest.warns(UserWarning, match="the source environment cannot restore"):
+        resumed.learn(10, reset_num_timesteps=False)
+    assert (resumed.num_timesteps, resumed.replay_buffer.target.size()) == (30, 30)
+
+
 def test_files_are_written_whole_or_not_at_all(tmp_path):
     model = small(RPO).learn(10, source_timesteps=0)
     path = tmp_path / "model.zip"
@@ -455,6 +490,15 @@ def test_source_data_fit_phi_0_and_spare_the_source(form, tmp_path):
     model.learn(5)
     assert model.dynamics.fitted
     assert model.source_timesteps == 5 * 8
+
+
+@pytest.mark.parametrize("done", [2.0, -1.0, 0.5])
+def test_ends_that_are_neither_yes_nor_no_are_refused(done, tmp_path):
+    rows = {"obs": np.zeros((5, 3)), "act": np.zeros((5, 1)), "next_obs": np.zeros((5, 3)), "rew": np.zeros(5)}
+    np.savez(tmp_path / "data.npz", **rows, done=np.array([0, 0, 1, 0, done]))
+    sac = SAC("MlpPolicy", pendulum(), policy_kwargs=SMALL_POLICY)
+    with pytest.raises(ValueError, match="source_data holds values of done other than 0 and 1"):
+        small_from(sac, source_data=tmp_path / "data.npz")
 
 
 def small_from(sac, **kwargs):

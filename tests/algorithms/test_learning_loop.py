@@ -288,8 +288,15 @@ def test_bad_input_is_refused_at_construction():
         small(RPTO, dynamics="physical")
     with pytest.raises(ValueError, match="real_ratio"):
         small(RPTO, real_ratio=1.5)
-    with pytest.raises(ValueError, match="weight_floor"):
-        small(RPTO, weight_floor=-1.0)
+    for floor in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="weight_floor"):
+            small(RPTO, weight_floor=floor)
+    for freq in (0, (0, "episode"), 1.5):
+        with pytest.raises(ValueError, match="train_freq"):
+            small(RPO, train_freq=freq)
+    for size in (0, -3, 2.5):
+        with pytest.raises(ValueError, match="target_size"):
+            small(RPO, replay_buffer_kwargs={"target_size": size})
     with pytest.raises(ValueError, match="source_steps"):
         small(RPTO, source_steps=0)
     with pytest.raises(ValueError, match="RPO does not use"):
@@ -318,6 +325,22 @@ def test_nan_from_an_environment_names_the_world(world):
     model = small(RPO, broken, sound) if world == "source" else small(RPO, sound, broken)
     with pytest.raises(ValueError, match=f"{world} environment returned"):
         model.learn(100, source_timesteps=0)
+
+
+def test_a_run_goes_on_after_a_target_step_that_was_not_finite(tmp_path):
+    broken = NaNAt(pendulum(12.0), 15)
+    model = small(RPO, target=broken)
+    with pytest.raises(ValueError, match="target environment returned"):
+        model.learn(30, source_timesteps=0)
+    assert (broken.count, model.num_timesteps, model.replay_buffer.size()) == (15, 15, 14)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = RPO.load(tmp_path / "model", env=pendulum(), target_env=pendulum(12.0), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    for one in (model, loaded):  # the step is spent, its transition is not stored, a new episode begins
+        one.learn(10, reset_num_timesteps=False)
+        assert (one.num_timesteps, one.replay_buffer.size()) == (25, 24)
+        assert np.isfinite(one.replay_buffer.target.observations[:24]).all()
 
 
 def test_offline_data_stand_in_for_the_target(tmp_path):

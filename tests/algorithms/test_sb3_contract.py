@@ -38,6 +38,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_rpto import RPO
 from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 
 EPISODE = 10
@@ -79,6 +80,17 @@ class Drift(gym.Env):
 
 def windy(**kwargs):
     return Drift(wind=0.05, **kwargs)
+
+
+class Still(Drift):
+    """Always where it began, so that nothing but noise moves the actions."""
+
+    def step(self, action):
+        return np.zeros(2, np.float32), *super().step(action)[1:]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
 
 
 def build(cls, env=None, target=None, policy="MlpPolicy", **kwargs):
@@ -212,6 +224,36 @@ def test_action_noise_of_several_environments(cls):
     ready = VectorizedActionNoise(noise, 2)
     model = learn(build(cls, vectorised(0.0), vectorised(0.05), action_noise=ready))
     assert model.action_noise is ready
+
+
+@ours
+@pytest.mark.parametrize(("train_freq", "sample_freq", "held"), [(1, -1, 1), (8, 4, 4), (8, -1, 8)])
+def test_exploration_noise_in_the_source_is_held_as_long_as_in_the_target(cls, train_freq, sample_freq, held):
+    kwargs = {"use_sde": True, "train_freq": train_freq, "sde_sample_freq": sample_freq}
+    model = build(cls, Still(), Still(), **kwargs)
+    EpisodeSource(model.env).interact(model, 24)
+    actions = model.replay_buffer.source.actions[:24, 0, 0]
+    assert len(set(actions.tolist())) == 24 // held
+    assert all(len(set(actions[i : i + held].tolist())) == 1 for i in range(0, 24, held))
+
+
+@pytest.mark.parametrize("cls", [cls for cls in ALGORITHMS if cls.updates_dynamics])
+def test_every_branch_has_exploration_noise_of_its_own(cls):
+    model = learn(build(cls, Still(), Still(), use_sde=True, source_steps=8, learning_starts=0), 5)
+    side = model.replay_buffer.source
+    newest = side.actions[: side.size(), 0, 0][-8:]
+    assert len(set(newest.tolist())) == 8
+
+
+@ours
+def test_a_policys_own_actions_are_those_in_the_source_too(cls):
+    class Careful(SACPolicy):
+        def _predict(self, observation, deterministic=False):
+            return super()._predict(observation, deterministic).clamp(-0.1, 0.1)
+
+    model = learn(build(cls, policy=Careful, learning_starts=0))
+    for side in (model.replay_buffer.source, model.replay_buffer.target):
+        assert 0.09 < np.abs(side.actions[: side.size()]).max() < 0.11
 
 
 @every_class
