@@ -364,3 +364,21 @@ def test_estimators_name_what_is_wrong():
         theory.policy_gap_estimate([[1.0]], [[1.0], [2.0]], gamma=0.9)
     with pytest.raises(ValueError, match="episode 0 needs"):
         theory.policy_gap_estimate([[1.0]], [[1.0, 2.0]], gamma=0.9)
+
+
+@pytest.mark.parametrize("name", ["reward", "initial", "gamma"])
+def test_worlds_that_differ_in_more_than_their_dynamics_are_refused(name):
+    world = small_world()
+    changed = {"reward": 2 * world.source.reward, "initial": world.source.initial[::-1], "gamma": 0.5}[name]
+    other = replace(world.target, **{name: changed})
+    with pytest.raises(ValueError, match=f"may differ in transition alone, but {name} differs"):
+        theory.relativity_gap(other, world.source, world.policy, world.old_policy)
+    for which in ("target", "old_source"):
+        with pytest.raises(ValueError, match=f"{name} differs"):
+            replace(world, **{which: other})
+
+
+def test_a_policy_that_is_no_distribution_is_refused():
+    world = small_world()
+    with pytest.raises(ValueError, match="policy must hold probabilities"):
+        theory.values(world.source, 2 * world.policy)

@@ -18,6 +18,7 @@ import numpy as np
 from sb3_rpto.theory.mdp import (
     FloatArray,
     TabularMDP,
+    check_worlds,
     expected_return,
     model_error,
     occupancy,
@@ -41,6 +42,7 @@ class Setting:
     :param old_source: the dynamics P_phi', the source before its last update (Theorem 3)
     :param policy: pi(a|s), shape (S, A)
     :param old_policy: pi'(a|s), the policy before its last update
+    :raises ValueError: for MDPs that differ in more than their dynamics
     """
 
     target: TabularMDP
@@ -48,6 +50,9 @@ class Setting:
     old_source: TabularMDP
     policy: FloatArray
     old_policy: FloatArray
+
+    def __post_init__(self) -> None:
+        check_worlds(self.source, self.target, self.old_source)
 
     @property
     def gamma(self) -> float:

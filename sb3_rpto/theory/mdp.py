@@ -44,6 +44,18 @@ class TabularMDP:
         _check_distribution("initial", self.initial)
 
 
+def check_worlds(*worlds: TabularMDP) -> None:
+    """Refuse MDPs that differ in more than their dynamics.
+
+    :raises ValueError: naming what else differs
+    """
+    first = worlds[0]
+    for other in worlds[1:]:
+        for name in ("reward", "initial", "gamma"):
+            if not np.array_equal(getattr(first, name), getattr(other, name)):
+                raise ValueError(f"the MDPs may differ in transition alone, but {name} differs; give them the same")
+
+
 class Values(NamedTuple):
     """The exact values of a policy in an MDP."""
 
@@ -56,6 +68,7 @@ def _under(mdp: TabularMDP, policy: FloatArray) -> FloatArray:
     """The Markov chain P_pi(s'|s) = sum_a pi(a|s) P(s'|s, a), shape (S, S)."""
     if policy.shape != mdp.transition.shape[:2]:
         raise ValueError(f"policy must have shape (S, A) = {mdp.transition.shape[:2]}, got {policy.shape}")
+    _check_distribution("policy", policy)
     chain: FloatArray = np.einsum("sa,sat->st", policy, mdp.transition)
     return chain
 
@@ -98,7 +111,11 @@ def total_variation(first: FloatArray, second: FloatArray) -> float:
 
 
 def model_error(target: TabularMDP, source: TabularMDP, policy: FloatArray) -> FloatArray:
-    """E over P' of r + gamma V(s'), less Q(s, a), with V and Q of (P, pi): what one step in P' adds, shape (S, A)."""
+    """E over P' of r + gamma V(s'), less Q(s, a), with V and Q of (P, pi): what one step in P' adds, shape (S, A).
+
+    :raises ValueError: for MDPs that differ in more than their dynamics
+    """
+    check_worlds(target, source)
     v, q, _ = values(source, policy)
     return np.einsum("sat,sat->sa", target.transition, source.reward + source.gamma * v) - q
 
