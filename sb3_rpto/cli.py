@@ -162,6 +162,8 @@ def _trace(parsed: argparse.Namespace) -> int:
     figures.require()
     if parsed.horizon is not None and not parsed.horizon > 0:
         raise ValueError(f"--horizon is {parsed.horizon:g}; give a time in s above 0")
+    if parsed.candidates == []:
+        raise ValueError("--candidates is empty; name kinds of effects, or leave it out to look for all")
     if parsed.calibrate < 0:
         raise ValueError(f"--calibrate is {parsed.calibrate}; give a number of data sets, or 0 for none")
     check_file(parsed.known, "--known")

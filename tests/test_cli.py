@@ -99,6 +99,7 @@ def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixtu
         ({"model": "CartPole-v1"}, "no MuJoCo model"),
         ({"options": ["--declare", "hinge.dampng"]}, "damping"),
         ({"options": ["--candidates", "friction"]}, "coulomb_friction"),
+        ({"options": ["--candidates", ""]}, "--candidates is empty"),
         ({"options": ["--horizon", "-1"]}, "--horizon"),
         ({"options": ["--calibrate", "-1"]}, "--calibrate"),
         ({"options": ["--seed", "one"]}, "sb3-rpto trace --help"),

@@ -73,7 +73,7 @@ def _write_inertia(world: World, body: int, values: np.ndarray, nominal: float) 
     inertia *= (values / inertia[:, 0])[:, None]
 
 
-def _servo(model: mujoco.MjModel, actuator: int) -> str:
+def servo_of(model: mujoco.MjModel, actuator: int) -> str:
     """What an actuator regulates: its bias takes back its gain on the position, ``kp (u - q)``, or on the velocity."""
     gain, (_, on_position, on_velocity) = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, :3]
     if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE and gain:
@@ -85,7 +85,7 @@ def _servo(model: mujoco.MjModel, actuator: int) -> str:
 
 
 def _read_kp(model: mujoco.MjModel, actuator: int) -> float:
-    kind = _servo(model, actuator)
+    kind = servo_of(model, actuator)
     if kind != "position":
         raise ValueError(f"the actuator is no position servo; declare its {'kv' if kind else 'gain'} or strength")
     return float(model.actuator_gainprm[actuator, 0])
@@ -97,13 +97,13 @@ def _write_kp(world: World, actuator: int, values: np.ndarray, nominal: float) -
 
 
 def _read_kv(model: mujoco.MjModel, actuator: int) -> float:
-    if not _servo(model, actuator):
+    if not servo_of(model, actuator):
         raise ValueError("the actuator is no position or velocity servo; declare its gain, damping or strength")
     return -float(model.actuator_biasprm[actuator, 2])
 
 
 def _write_kv(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
-    # Of the two servos that have it, that of the velocity: :func:`_servo` cannot tell once the gain has changed.
+    # Of the two servos that have it, that of the velocity: :func:`servo_of` cannot tell once the gain has changed.
     if world.model.actuator_gainprm[actuator, 0] and not world.model.actuator_biasprm[actuator, 1]:
         world.field("actuator_gainprm")[:, actuator, 0] = values
     world.field("actuator_biasprm")[:, actuator, 2] = -values
@@ -382,7 +382,8 @@ def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:
     :return: one :class:`Declared` for each name, in order, none twice: the last entry gives its bounds
     :raises TypeError: one string in place of a list
     :raises ValueError: unknown or ambiguous names (the near ones are said), wildcards that match nothing, malformed
-        bounds, bounds that do not hold the nominal value, a nominal value of zero where only factors make sense
+        bounds, bounds below 0 of what is never negative, bounds that do not hold the nominal value, a nominal value of
+        zero where only factors make sense
     """
     if isinstance(names, str):
         raise TypeError(f"declared must be a list of names, not the string {names!r}; write [{names!r}]")
@@ -391,13 +392,18 @@ def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:
         name, equals, given = entry.partition("=")
         bounds = _bounds(entry, given) if equals else None
         matches = [name]
-        if any(c in name for c in "*?["):
+        if any(c in name for c in "*?[") and name not in parameter_names(model):  # names may have brackets
             matches = fnmatch.filter(parameter_names(model), name)
             matches = [m for m in matches if _scalable(model, m)]
             if not matches:
                 raise ValueError(f"declared {name!r} matches nothing; {near(name, parameter_names(model))}")
         for match in matches:
             one = Declared(model, match, bounds)
+            least, bounded = one.parameters[0].lower, bounds is not None and one.owner != "actuator"
+            if bounded and least <= 0 <= one.nominal and (one.scales or least < 0):
+                raise ValueError(
+                    f"{match}: the lower bound {least:g} must be {'above' if one.scales else 'at least'} 0"
+                )
             found[one.number] = one
     return list(found.values())
 

@@ -95,8 +95,7 @@ class Simulation:
         commands = filter_commands(active, drive.commands, self.model.opt.timestep)
         world.restore()
         world.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        self.set(world, drive.settings)
-        prepare(world, active)
+        prepare(world, [*self.known(drive.settings), *active])
         out_q = np.empty((n, steps + 1, self.model.nq))
         out_v = np.empty((n, steps + 1, self.model.nv))
         out_q[:, 0], out_v[:, 0] = qpos, qvel
@@ -186,13 +185,12 @@ class Simulation:
             self._worlds[n] = BatchWorld(self.model, n, self.nthread)
         return self._worlds[n]
 
-    def set(self, world: World, settings: Mapping[str, np.ndarray]) -> None:
-        """Write parameters that are known of each simulation, by declared name, (n,)."""
+    def known(self, settings: Mapping[str, np.ndarray]) -> Active:
+        """Parameters that are known of each simulation, by declared name, (n,), as effects with their values."""
         for name in settings:
             if name not in self._settings:
                 self._settings[name] = Declared(self.model, name, (-np.inf, np.inf))
-        for name in sorted(settings, key=lambda name: self._settings[name].rank):
-            self._settings[name].write(world, settings[name][:, None])
+        return [(self._settings[name], values[:, None]) for name, values in settings.items()]
 
 
 Active = Sequence[tuple[Effect, np.ndarray]]
@@ -211,7 +209,7 @@ def quiet() -> Iterator[None]:
 
 
 def prepare(world: World, active: Active) -> None:
-    """Write what the effects change of the model: numbers that were declared first, additions after."""
+    """Write what the effects change of the model: numbers, known or declared, first, additions after."""
     for effect, x in sorted(active, key=lambda pair: pair[0].rank if isinstance(pair[0], Declared) else math.inf):
         effect.write(world, x)
     world.settle()

@@ -17,6 +17,8 @@ OTHER_UNIT = 100.0
 DEGREES = 180 / np.pi
 #: Times in s should be told as finely as this.
 FINEST = 1e-10
+#: A clock comes in bursts where more than this share of the steps are gaps, and the mean is so many times the median.
+BURSTS, BURST = 0.1, 3.0
 #: Norms of quaternions may be off by so much.
 UNIT = 0.05
 
@@ -36,6 +38,7 @@ class Episode:
     :param params: settings known for this run, ``object.parameter`` to SI value
     :param part: ``"train"``, ``"select"`` or ``"test"`` where the file says so
     :param usable: False where the state is not known, shape (T,); all True by default
+    :param after_gap: whether it begins where samples are missing, so that the commands before it are not known
     :raises ValueError: ``usable`` does not fit ``time``
     """
 
@@ -50,6 +53,7 @@ class Episode:
     params: Mapping[str, float] = field(default_factory=dict)
     part: str | None = None
     usable: np.ndarray = None  # type: ignore[assignment]
+    after_gap: bool = False
 
     def __post_init__(self) -> None:
         if self.usable is None:
@@ -111,6 +115,13 @@ def read_run(file: str, name: str, rows: dict[str, np.ndarray], columns: Columns
         raise ValueError(
             f"{where}: column 'time' does not increase at row {back[0] + 1} of the episode ({time[back[0]]:g} s, then "
             f"{time[back[0] + 1]:g} s); sort the rows, drop doubled ones, or give each run its own episode"
+        )
+    steps = np.diff(time)
+    middle, mean = float(np.median(steps)), float(np.mean(steps))
+    if np.mean(steps > checks.GAP * middle) > BURSTS and mean > BURST * middle:
+        raise ValueError(
+            f"{where}: the clock comes in bursts, of steps of {middle:.3g} s where the mean is {mean:.3g} s; give the "
+            "times at which samples were taken, not those at which they arrived"
         )
     for column in (c for c in rows if c == "split" or c.startswith("param.")):
         if len(np.unique(rows[column])) > 1:
@@ -178,7 +189,7 @@ def repair(run: Episode, columns: Columns, findings: list[Finding]) -> list[Epis
         arrays = {
             k: getattr(run, k)[rows].copy() for k in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable")
         }
-        pieces.append(replace(run, name=name, **arrays))
+        pieces.append(replace(run, name=name, after_gap=i > 0, **arrays))
         _channels(pieces[-1], columns, findings)
     return pieces
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
-from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.windows import Windows, cut, first_sample
@@ -20,9 +18,6 @@ OVERLAP = 0.8
 #: Most predictions of a horizon.
 MOST = 200
 RESAMPLES = 400
-#: Test runs that err by so many times their noise are told; in half a second none of the benchmark's 187 settled sets
-#: with noise did by above 2.9.
-MISSED = 5.0
 #: Draws of the noise for each window of the floor: few windows of a long horizon say little by one draw each.
 DRAWS = 8
 
@@ -172,28 +167,6 @@ def noise_floor(
         pooled = _pool(off - true + noise, usable, windows.take(index), _observed(data), horizon, seed)
         found.append(replace(pooled, windows=count))
     return found
-
-
-def missed(after: list[HorizonError], floor: list[HorizonError], runs: Sequence[str]) -> list[Finding]:
-    """Whether a model errs far more than noise would, in runs that nothing was fitted to; of the worst joint.
-
-    :param after: errors of a model that accounts for the runs that it was fitted to
-    :param floor: what noise alone leaves
-    :param runs: names of these runs; none where nothing was set apart
-    """
-    errors = {error.horizon: error.rmse for error in after}
-    pairs = [(level, errors[level.horizon] / level.rmse) for level in floor if level.horizon in errors]
-    if not (pairs and runs):
-        return []
-    level, ratios = max(pairs, key=lambda pair: float(pair[1].max()))
-    if ratios.max() <= MISSED:
-        return []
-    message = (
-        f"{level.joints[int(ratios.argmax())]} errs {ratios.max():.0f} times what noise leaves in {level.horizon:g} s, "
-        "though the model accounts for the runs that it was fitted to: a test run differs (a moved sensor, another "
-        "load), or moves as none of those did; the verdict is about those"
-    )
-    return [Finding("missed", ", ".join(runs), message)]
 
 
 def _observed(data: Measurements) -> tuple[str, ...]:

@@ -366,5 +366,7 @@ def _expand(paths: Paths) -> list[str]:
         matches = [pattern] if os.path.exists(pattern) else sorted(glob.glob(pattern, recursive=True))
         if not matches:
             raise FileNotFoundError(f"no file matches {pattern!r}; check the path or the pattern")
+        for folder in (match for match in matches if os.path.isdir(match)):
+            raise ValueError(f"{folder!r} is a folder; name its files, such as {os.path.join(folder, '*.csv')!r}")
         found += matches
     return list(dict.fromkeys(found))

@@ -133,6 +133,19 @@ def soft_friction(model: mujoco.MjModel) -> list[Finding]:
     return found
 
 
+def soft_ties(model: mujoco.MjModel) -> list[Finding]:
+    """Equality constraints that give way as MuJoCo's do where nothing else is said; those of a machine hardly do."""
+    found = []
+    for tie in np.flatnonzero((model.eq_solref[:, 0] > SOFT) & (model.eq_active0 != 0)):
+        message = (
+            f"the constraint gives way over some {1e3 * model.eq_solref[tie, 0]:g} ms (its solref); where the "
+            f'machine\'s is rigid, set solref="{max(0.002, 2 * model.opt.timestep):g} 1" '
+            'solimp="0.99 0.999 0.0001" in the model'
+        )
+        found.append(Finding("soft tie", f"equality {model.equality(tie).name or tie}", message))
+    return found
+
+
 def _check_clock(model: mujoco.MjModel, data: Measurements) -> None:
     """Refuse samples so far apart that their times can hardly be in seconds."""
     steps = [np.diff(e.time) for e in data.episodes if len(e) > 1]

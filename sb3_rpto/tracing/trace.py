@@ -13,11 +13,19 @@ from scipy.stats import t as student
 
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.units import units_at
-from sb3_rpto.tracing import wording
-from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE, Adequacy
+from sb3_rpto.tracing.adequacy import TOLERANCE, Adequacy
+from sb3_rpto.tracing.cautions import (
+    above_noise,
+    at_bounds,
+    early_response,
+    encoder_zeros,
+    missed,
+    strays,
+    undetermined,
+)
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.concentrate import NOTHING
-from sb3_rpto.tracing.evaluate import horizon_errors, missed, noise_floor
+from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Loss, Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.model_checks import doubts
@@ -30,15 +38,8 @@ from sb3_rpto.tracing.search import Found, find
 from sb3_rpto.tracing.select import Selection, Selector
 from sb3_rpto.tracing.windows import Windows
 
-#: Windows count as stray, too, only where they err by so many times the typical error.
-APART = 3.0
 #: Verdicts that leave nothing to look for.
 SETTLED = ("complete", "explained")
-#: A declared number whose interval is wider than this share of itself and of its nominal value is not determined: it
-#: spans an order of magnitude. (Where both are next to nothing: of what is plausible.)
-VAGUE = 0.9
-#: Commands one sample earlier that leave less than this share of the error were logged after they had acted.
-EARLY = 0.5
 _NEVER = "beside what is kept it lowers the error of unseen windows by nothing clear"
 #: Most iterations of the last fits: where two parameters do nearly the same, a descent goes slowly along their valley.
 FINAL = 40
@@ -108,8 +109,7 @@ def trace(
         )
         findings.append(Finding("time step", "model", message))
     if selector.select is None:
-        count = len(selector.train.windows)
-        message = f"selected on {count} windows of the training runs by cross-validation over blocks"
+        message = f"selected on {len(selector.train.windows)} windows of training runs by cross-validation over blocks"
         findings.append(Finding("split", "training runs", message))
 
     say(0.85, "fitting the final model")
@@ -134,11 +134,14 @@ def trace(
     verdict = judge(found.before, found.after, bool(selection.model.effects))
     floor = noise_floor(simulation, final, data, sigma, seed)
     if verdict in SETTLED:
-        findings += missed(errors_after, floor, sorted({e.run for e in set_up.test.episodes}))
+        findings += missed(simulation, final, set_up.test, sigma, seed)
+        findings += above_noise(errors_after, floor, found.after.ratio) if set_up.test.episodes else []
     else:
-        findings += doubts(set_up.nominal, fitted) + _early(found, fitted)
-    findings += _undetermined(problem, final, intervals) + _at_bounds(problem, final)
-    findings += _strays(selector, final, set_up, seed)
+        findings += doubts(set_up.nominal, fitted) + early_response(found, fitted)
+    findings += undetermined(problem, final, intervals) + at_bounds(problem, final)
+    findings += strays(selector, final, set_up, seed)
+    kept = _kept(selection, simulation, final, intervals, selector.limit(selection.model), seed)
+    findings += encoder_zeros(simulation.model, [traced.effect for traced in kept])
     unstable = problem.unstable(final)
     if unstable:
         message = f"in {unstable} of {len(problem.windows)} the corrected model became unstable; lower its timestep"
@@ -146,7 +149,7 @@ def trace(
     return Report(
         verdict=verdict,
         declared=_declared(simulation, final, intervals),
-        effects=_kept(selection, simulation, final, intervals, selector.limit(selection.model), seed),
+        effects=kept,
         candidates=_fates(simulation, found.screening, selection),
         adequacy_before=found.before,
         adequacy_after=found.after,
@@ -195,20 +198,6 @@ def _of_own_steps(set_up: SetUp, found: Found, declared: Sequence[str], threads:
         return None
     message = "from the model's own steps in time, as shows with what was found first; searched again in such steps"
     return Finding("simulated", "fitted runs", message)
-
-
-def _at_bounds(problem: Problem, values: np.ndarray) -> list[Finding]:
-    """What was given and ends at a bound that it did not begin at; nothing is below 0 of what cannot be negative."""
-    found = []
-    owners = [(e, p) for e in problem.simulation.effects for p in e.parameters]
-    there = (values <= problem.lower) | (values >= problem.upper)
-    for i in np.flatnonzero(problem.known & there & (values != 0) & (values != problem.null)):
-        effect, parameter = owners[i]
-        is_number = isinstance(effect, Declared)
-        where = f"declared {effect.label}" if is_number else f"known {effect.label}, {parameter.name}"
-        message = f"{values[i]:.4g} is its bound; where the machine may lie beyond, give wider ones"
-        found.append(Finding("at its bound", where, message + (f" ({effect.label}=low:high)" if is_number else "")))
-    return found
 
 
 def _steady(progress: Progress | None) -> Progress:
@@ -308,63 +297,6 @@ def judge(before: Adequacy, after: Adequacy, named: bool) -> str:
     else:
         halved = np.log(max(after.ratio, 1.0)) <= 0.5 * np.log(before.ratio)
     return "partly explained" if halved else "unexplained"
-
-
-def _strays(selector: Selector, values: np.ndarray, set_up: SetUp, seed: int) -> list[Finding]:
-    """Windows that the final model misses by far, run by run: one that stalled or was touched leaves them."""
-    parts = [(selector.train, set_up.fitted)] + ([(selector.select, set_up.select)] if selector.select else [])
-    fits = [problem.score(values) for problem, _ in parts]
-    errors = np.concatenate([fit.errors for fit in fits])
-    noise = np.concatenate([problem.noise_errors(fit, seed).ravel() for (problem, _), fit in zip(parts, fits)])
-    limit = max(BEYOND * float(np.quantile(noise, 0.99)), APART * float(np.median(errors)))
-    runs = np.array([data.episodes[i].run for problem, data in parts for i in problem.windows.episode])
-    stray = errors > limit
-    whole = [run for run in sorted({*runs[stray]}) if stray[runs == run].mean() > 0.5]
-    groups = [(f"run {run}", runs == run) for run in whole] + [("fitted runs", ~np.isin(runs, whole))]
-    message = "{} of {} windows err far more than the others; fits give them little weight (robust loss)"
-    return [
-        Finding("stray windows", where, message.format(int(stray[rows].sum()), int(rows.sum())))
-        for where, rows in groups
-        if stray[rows].any()
-    ]
-
-
-def _undetermined(problem: Problem, values: np.ndarray, intervals: np.ndarray) -> list[Finding]:
-    """What was given of which the data say next to nothing: where nothing moves, or where several act alike."""
-    found = []
-    owners = [(e, p) for e in problem.simulation.effects for p in e.parameters]
-    for i in np.flatnonzero(problem.known & problem.simulation.strength):
-        (effect, parameter), value, (low, high) = owners[i], float(values[i]), intervals[:, i]
-        scale = max(abs(value), abs(float(problem.null[i])) or float(problem.size[i]))
-        if not high - low <= VAGUE * scale:  # nor where there is no interval
-            is_number = isinstance(effect, Declared)
-            where = f"declared {effect.label}" if is_number else f"known {effect.label}, {parameter.name}"
-            message = (
-                f"{value:.4g} {wording.interval(low, high)}: these data do not tell it; move so that it matters, do "
-                f"not {'declare it, or declare' if is_number else 'give it, or give'} fewer that act alike"
-            )
-            found.append(Finding("undetermined", where, message))
-    return found
-
-
-def _early(found: Found, data: Measurements) -> list[Finding]:
-    """Commands that were logged with the sample after they acted: no actuator acts before it is told."""
-    train, base = found.on.fine.train, found.base.fit
-    w, step = train.windows, float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
-    if w.exact or not w.drive.commands.shape[2]:
-        return []
-    rows = max(1, round(step / float(train.simulation.model.opt.timestep)))
-    commands = np.concatenate([w.drive.commands[:, rows:], w.drive.commands[:, -rows:]], axis=1)
-    earlier = Problem(train.simulation, replace(w, drive=w.drive._replace(commands=commands)), train.scales)
-    fit = earlier.fit(base.values, found.on.fine.free(()), base.starts)
-    share = float(np.median(fit.errors) / np.median(base.errors))
-    if share > EARLY:
-        return []
-    message = (
-        f"with all commands one sample ({step:.3g} s) earlier the declared model errs by {share:.0%} of what it does: "
-        "each row seems to hold the command of the row before; shift the ctrl columns up a row and trace again"
-    )
-    return [Finding("early response", "all episodes, ctrl", message)]
 
 
 def _check_arguments(

@@ -70,6 +70,23 @@ def test_default_bounds() -> None:
     assert damping.with_values(np.array([-3.0])).values == [0.0]
 
 
+@pytest.mark.parametrize(
+    ("name", "least"),
+    [("arm.mass=-1:3", "above 0"), ("arm.mass=0:30", "above 0"), ("hinge.damping=-1:2", "at least 0")],
+)
+def test_bounds_that_no_machine_has_are_refused(name: str, least: str) -> None:
+    with pytest.raises(ValueError, match=f"the lower bound .* must be {least}"):
+        declare(MODEL, [name])
+
+
+def test_names_may_have_brackets() -> None:
+    xml = """<mujoco><worldbody><body name="leg[0]"><joint name="hip[0]" damping="0.1"/><geom size="0.1"/></body>
+    <body name="leg[1]"><joint name="hip[1]" damping="0.2"/><geom size="0.1"/></body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    assert [d.label for d in declare(model, ["hip[0].damping", "leg[1].mass"])] == ["hip[0].damping", "leg[1].mass"]
+    assert [d.label for d in declare(model, ["hip*.damping"])] == ["hip[0].damping", "hip[1].damping"]
+
+
 def test_given_bounds() -> None:
     (damping,) = declare(MODEL, ["hinge.damping=0.1:0.9"])
     assert (damping.parameters[0].lower, damping.parameters[0].upper) == (0.1, 0.9)

@@ -89,6 +89,20 @@ def test_declared_numbers_are_those_of_an_edited_model() -> None:
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("known", ["m2.strength", "lower.inertia", "lower.mass"])
+@pytest.mark.parametrize("declared", ["m2.kp", "m2.kv", "m2.gain", "lower.mass", "elbow.damping"])
+def test_a_setting_holds_whatever_else_is_declared(known: str, declared: str) -> None:
+    if known == declared:
+        return
+    qpos, qvel, commands = start(2)
+    (number,) = declare(MODEL, [known])
+    drive = Drive(commands, settings={known: number.nominal * np.array([0.5, 1.5])})
+    alone = Simulation(MODEL, [], 1).rollout(np.empty((2, 0)), qpos, qvel, drive)
+    sim = Simulation(MODEL, declare(MODEL, [declared]), 1)
+    for got, expected in zip(sim.rollout(np.tile(sim.null, (2, 1)), qpos, qvel, drive), alone, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
+
+
 def test_settings_differ_by_simulation() -> None:
     qpos, qvel, commands = start(2)
     damping = np.array([0.02, 0.5])

@@ -257,6 +257,20 @@ def test_gap_splits_the_episode_and_keeps_the_run_together():
     assert [len(m.episodes) for m in (train, select, test)] == [2, 0, 0]
 
 
+@pytest.mark.parametrize("burst", [3, 6])
+def test_a_clock_that_comes_in_bursts_is_refused(burst):
+    table = swing()
+    rows = np.arange(len(table["time"]))
+    table["time"] = 0.01 * burst * (rows // burst) + 1e-4 * (rows % burst)
+    with pytest.raises(ValueError, match=r"the clock comes in bursts, of steps of 0\.0001 s where the mean is"):
+        Measurements.from_tables({"a": table})
+
+
+def test_a_folder_is_no_file(tmp_path):
+    with pytest.raises(ValueError, match=r"is a folder; name its files, such as .*\*\.csv"):
+        Measurements.from_csv(str(tmp_path))
+
+
 def test_short_stretch_is_set_aside_with_a_finding():
     table = swing()
     table["time"][197:] += 0.2

@@ -6,7 +6,7 @@ import pytest
 from simulated import briefly
 
 from sb3_rpto.tracing import Measurements, trace
-from sb3_rpto.tracing.model_checks import soft_friction
+from sb3_rpto.tracing.model_checks import soft_friction, soft_ties
 from sb3_rpto.tracing.prepare import SetUp
 
 CRANK = """
@@ -62,6 +62,19 @@ def test_friction_that_creeps_is_said_to() -> None:
     model = mujoco.MjModel.from_xml_string(CRANK.format(friction='frictionloss="0.1"'))
     assert [f.where for f in soft_friction(model)] == ["joint crank"]
     assert not soft_friction(mujoco.MjModel.from_xml_string(CRANK.format(friction="")))
+
+
+def test_ties_that_give_way_are_said_to() -> None:
+    fingers = """<mujoco><worldbody><body><joint name="a" type="slide"/><geom size="0.1"/></body><body pos="1 0 0">
+    <joint name="b" type="slide"/><geom size="0.1"/></body></worldbody>
+    <equality><joint name="mimic" joint1="a" joint2="b" {}/></equality></mujoco>"""
+    for written, places in (
+        ("", ["equality mimic"]),
+        ('active="false"', []),
+        ('solref="0.002 1" solimp="0.99 0.999 0.0001"', []),
+        ('solref="-5000 -100"', []),  # a stiffness that somebody has chosen
+    ):
+        assert [f.where for f in soft_ties(mujoco.MjModel.from_xml_string(fingers.format(written)))] == places
 
 
 def test_finer_steps_are_not_taken_where_the_model_is_adequate(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -128,6 +128,15 @@ def test_a_test_run_unlike_all_others_is_told_beside_the_verdict() -> None:
     assert not [f for f in simple_report().findings if f.kind == "missed"]
 
 
+def test_one_test_run_of_several_that_differs_is_named_alone() -> None:
+    data = parted(few(9), ["train"] * 3 + ["select"] * 2 + ["test"] * 4)
+    data.episodes[-1] = replace(data.episodes[-1], qpos=data.episodes[-1].qpos + 0.03)
+    report = traced_simply(data, kinds=["coulomb_friction"])
+    assert report.verdict == "explained"
+    (found,) = [f for f in report.findings if f.kind == "missed"]
+    assert found.where == data.episodes[-1].run
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_complete_model_is_complete_and_nothing_is_named(seed: int) -> None:
     p, report = planted(seed=seed), complete(seed)

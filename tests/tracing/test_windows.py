@@ -353,3 +353,15 @@ def test_positions_that_were_not_measured_are_not_compared() -> None:
     windows = cut(mujoco.MjModel.from_xml_string(PENDULUM), data, SIGMA, 0.4, 100)
     assert windows.measured.shape[2] == 0
     assert len(windows.sigma) == len(windows.columns) == 0
+
+
+@pytest.mark.parametrize(("seconds", "waits"), [(4.0, 0.2), (0.6, 0.15)])
+def test_after_a_gap_windows_wait_for_commands_that_are_not_known(seconds: float, waits: float) -> None:
+    time = clock(int(200 * (2 + seconds)))
+    time[400:] += 0.3
+    data = ramps([time])
+    assert [e.after_gap for e in data.episodes] == [False, True]
+    windows = cut(compiled(), data, SIGMA, 0.2, 100)
+    first = [windows.time[windows.episode == i].min() - data.episodes[i].time[0] for i in (0, 1)]
+    assert first[0] < 0.1  # smoothing alone
+    assert first[1] == pytest.approx(waits, abs=0.006)

@@ -1,0 +1,44 @@
+"""What a reader is told beside a verdict."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from sb3_rpto.effects.forces import Spring, TorqueOffset
+from sb3_rpto.tracing.cautions import above_noise, encoder_zeros
+from sb3_rpto.tracing.evaluate import HorizonError
+
+SERVO = """<mujoco><worldbody><body><joint name="elbow" axis="0 1 0"/><geom size="0.1"/></body></worldbody>
+<actuator>{}</actuator></mujoco>"""
+ERROR = HorizonError(
+    0.5, ("a", "b"), np.array([1.5e-3, 1e-3]), np.array([1.3e-3, 0.9e-3]), np.array([1.7e-3, 1.1e-3]), np.zeros(2), 40
+)
+FLOOR = replace(ERROR, rmse=np.array([1e-3, 1e-3]), low=np.full(2, 0.9e-3), high=np.full(2, 1.1e-3))
+
+
+@pytest.mark.parametrize(("ratio", "low", "told"), [(1.3, 1.3e-3, True), (1.3, 1e-3, False), (1.05, 1.3e-3, False)])
+def test_a_model_that_few_windows_pass_is_told_where_the_test_runs_deny_it(
+    ratio: float, low: float, told: bool
+) -> None:
+    after = replace(ERROR, low=np.array([low, 0.9e-3]))
+    found = above_noise([after, replace(after, horizon="whole run")], [FLOOR], ratio)
+    assert [f.kind for f in found] == ["few windows"] * told
+
+
+def named(actuator: str, torque: float = -3.75) -> list[str]:
+    model = mujoco.MjModel.from_xml_string(SERVO.format(actuator))
+    effects = [TorqueOffset("elbow", offset=torque), Spring("elbow", stiffness=1.0)]
+    for effect in effects:
+        effect.bind(model)
+    return [f.message for f in encoder_zeros(model, effects)]
+
+
+def test_a_constant_torque_where_a_servo_holds_may_be_the_encoders_zero() -> None:
+    (message,) = named('<position joint="elbow" kp="30"/>')
+    assert "by an error of 0.125 rad" in message
+    (geared,) = named('<position joint="elbow" kp="30" gear="0.5"/>')
+    assert "by an error of 0.5 rad" in geared
+    for other in ('<motor joint="elbow"/>', '<velocity joint="elbow" kv="3"/>'):
+        assert named(other) == []
