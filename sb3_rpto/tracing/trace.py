@@ -109,7 +109,8 @@ def trace(
         )
         findings.append(Finding("time step", "model", message))
     if selector.select is None:
-        message = f"selected on {len(selector.train.windows)} windows of training runs by cross-validation over blocks"
+        count = len(selector.train.windows)
+        message = f"selected on {count} windows of the training runs by cross-validation over blocks"
         findings.append(Finding("split", "training runs", message))
 
     say(0.85, "fitting the final model")
