@@ -106,7 +106,10 @@ def test_lemma_1_is_exact(seed: int, index: int):
 def test_lemma_1_needs_one_initial_distribution():
     source, target = leak(0.3, 0.0), replace(leak(0.3, 0.0), initial=np.array([0.0, 1.0, 0.0]))
     difference = theory.expected_return(target, ONE_ACTION) - theory.expected_return(source, ONE_ACTION)
-    assert theory.dynamics_gap(target, source, ONE_ACTION) == pytest.approx(0) != difference
+    same_dynamics = replace(target, initial=source.initial)
+    assert theory.dynamics_gap(same_dynamics, source, ONE_ACTION) == pytest.approx(0) != difference
+    with pytest.raises(ValueError, match="initial differs"):
+        theory.dynamics_gap(target, source, ONE_ACTION)
 
 
 # --------------------------------------------------------------------------------- inequalities
