@@ -592,8 +592,10 @@ class Scripted(EpisodeSource):
     def __init__(self, earns: list[float]) -> None:
         self.returns = deque()
         self.earns = iter(earns)
+        self.asked: list[int] = []
 
     def interact(self, model: object, n_steps: int, random: bool = False) -> int:
+        self.asked.append(n_steps)
         self.returns.extend([r] if (r := next(self.earns, None)) is not None else [])
         return n_steps
 
@@ -613,11 +615,9 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
     monkeypatch.setattr(closing, "ROUND", 20)
     monkeypatch.setattr(closing, "FRESH", 160)
     updates: list[int] = []
-    noises: list[None] = []
+    source = Scripted(earns)
     made = SimpleNamespace(
-        use_sde=True,
-        actor=SimpleNamespace(reset_noise=lambda: noises.append(None)),
-        _source_world=Scripted(earns),
+        _source_world=source,
         updates_per_step=30,
         source_steps=20,
         batch_size=32,
@@ -629,7 +629,7 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
     closing.learn_in_source(made, lambda: rehearsed.append(None))  # type: ignore[arg-type]
     assert updates == [30] * rounds
     assert len(rehearsed) == 1 + rounds
-    assert len(noises) == rounds
+    assert source.asked == [20] * rounds  # in the source each call draws gSDE's noise anew
     assert made.source_timesteps == 5 + 20 * rounds
 
 
