@@ -11,7 +11,7 @@ import numpy as np
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.world import World
 
-_LONGEST = 0.2  # s; a longer delay is a fault of the log
+LONGEST_DELAY = 0.2  # s; a longer delay is a fault of the log
 _SLOWEST = 0.25  # s; of a slower lag the past that windows keep says too little
 
 
@@ -26,7 +26,7 @@ class CommandDelay(Effect):
 
     kind = "command_delay"
     place = "actuator"
-    parameters = (Parameter("delay", "s", 0.01, lower=0.0, upper=_LONGEST),)
+    parameters = (Parameter("delay", "s", 0.01, lower=0.0, upper=LONGEST_DELAY),)
     equation = "u(t - delay)"
     excite = "commands that change quickly"
     order = 0
@@ -34,7 +34,7 @@ class CommandDelay(Effect):
     def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
         """Read the past at the delay."""
         if not memory:
-            depth = int(np.ceil(_LONGEST / dt)) + 2
+            depth = int(np.ceil(LONGEST_DELAY / dt)) + 2
             memory["past"], memory["k"] = np.repeat(u[:, None], depth, axis=1), -1
         past = memory["past"]
         depth = past.shape[1]

@@ -95,7 +95,7 @@ class Simulation:
         commands = filter_commands(active, drive.commands, self.model.opt.timestep)
         world.restore()
         world.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        prepare(world, [*self.known(drive.settings), *active])
+        prepare(world, [*self.from_settings(drive.settings), *active])
         out_q = np.empty((n, steps + 1, self.model.nq))
         out_v = np.empty((n, steps + 1, self.model.nv))
         out_q[:, 0], out_v[:, 0] = qpos, qvel
@@ -185,7 +185,7 @@ class Simulation:
             self._worlds[n] = BatchWorld(self.model, n, self.nthread)
         return self._worlds[n]
 
-    def known(self, settings: Mapping[str, np.ndarray]) -> Active:
+    def from_settings(self, settings: Mapping[str, np.ndarray]) -> Active:
         """Parameters that are known of each simulation, by declared name, (n,), as effects with their values."""
         for name in settings:
             if name not in self._settings:

@@ -97,7 +97,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     # The motion at a sample answers to the commands held before and after it alike.
     around = 0.5 * (commands + np.concatenate([commands[:1], commands[:-1]]))
     world = BatchWorld(nominal, 1, 1)
-    settings = simulation.known({name: np.array([value]) for name, value in e.params.items()})
+    settings = simulation.from_settings({name: np.array([value]) for name, value in e.params.items()})
     prepare(world, [*settings, *active])
     model = world.batch.get_model(0)
     friction = model.dof_frictionloss.copy()

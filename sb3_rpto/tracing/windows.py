@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects import Drive
+from sb3_rpto.effects.commands import LONGEST_DELAY
 from sb3_rpto.effects.names import object_id
 from sb3_rpto.effects.simulation import memory, names_of
 from sb3_rpto.tracing import checks
@@ -19,8 +20,8 @@ from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, TRUST, half_step, st
 
 #: Seconds of commands kept from before a window, for effects that delay and filter: four constants of the slowest lag.
 MEMORY = 1.0
-#: After a gap the longest delay of the library is waited for, in s, at most for this share of what is there.
-RECALL, PATIENCE = 0.2, 0.25
+#: After a gap the longest delay of the library is waited for, at most for this share of what is there.
+WAITED = 0.25
 #: Exact data (from a simulator) count as noisy by this share of a position's standard deviation.
 EXACT = 1e-4
 #: Least length of a block of windows in s; blocks count as independent.
@@ -184,7 +185,7 @@ def first_sample(model: mujoco.MjModel, episode: Episode, whole_states: bool) ->
     After a gap an effect that is not in the model may remember, too: commands are waited for there.
     """
     duration = float(episode.time[-1] - episode.time[0])
-    wait = max(memory(model), min(RECALL, PATIENCE * duration) if episode.after_gap else 0.0)
+    wait = max(memory(model), min(LONGEST_DELAY, WAITED * duration) if episode.after_gap else 0.0)
     known = int(np.searchsorted(episode.time, episode.time[0] + wait - 1e-9))
     step = float(np.median(np.diff(episode.time)))
     return min(max(known, 0 if whole_states else max(HALF_COUNT, round(HALF_WIDTH / step))), len(episode) - 1)
