@@ -13,7 +13,7 @@ setup: .venv/.ready
 	touch $@
 
 demo: setup
-	$(BIN)/python examples/transfer_double_pendulum.py
+	$(BIN)/python examples/close_the_loop.py
 
 lint: setup
 	$(BIN)/ruff check .

@@ -136,21 +136,23 @@ def main() -> None:
     ]
     errors = {"seed": arguments.seed, "model_error_before": error_before, "model_error_after": error_after}
     pd.DataFrame(labelled).assign(**errors).to_csv(arguments.out / f"curves_{arguments.seed}.csv", index=False)
-    draw(curve.rows, rival_curve.rows, arguments.out / "learning_curve.png")
+    curves = {"RPTO, ensemble": curve.rows, "SAC, fine-tuned": rival_curve.rows}
+    draw(curves, "Inverted double pendulum, half the motor", arguments.out / "learning_curve.png")
 
 
-def draw(rows: list[dict[str, float]], rival: list[dict[str, float]], path: Path) -> None:
+def draw(curves: dict[str, list[dict[str, Any]]], title: str, path: Path) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     figure, axis = plt.subplots(figsize=(6, 4), constrained_layout=True)
-    for curve, label in ((rows, "RPTO, ensemble"), (rival, "SAC, fine-tuned")):
-        axis.plot([row["steps"] for row in curve], [row["return"] for row in curve], marker="o", label=label)
-    axis.axhline(rows[0]["return"], linestyle=":", color="grey", label="zero-shot")
-    axis.set(xlabel="target steps", ylabel="return (10 episodes)", title="Inverted double pendulum, half the motor")
-    axis.set_ylim(0, 1.05 * np.max([row["return"] for row in rows + rival]))
+    for label, rows in curves.items():
+        axis.plot([row["steps"] for row in rows], [row["return"] for row in rows], marker="o", label=label)
+    everything = [row for rows in curves.values() for row in rows]
+    axis.axhline(everything[0]["return"], linestyle=":", color="grey", label="zero-shot")
+    axis.set(xlabel="target steps", ylabel="return (10 episodes)", title=title)
+    axis.set_ylim(0, 1.05 * np.max([row["return"] for row in everything]))
     axis.legend()
     figure.savefig(path, dpi=110)
     print(f"learning curve: {path}")

@@ -7,9 +7,11 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+import pandas as pd
 import pytest
 from stable_baselines3 import SAC
 
+from sb3_rpto.algorithms import closing
 from sb3_rpto.effects.carry import load_corrected
 from sb3_rpto.tracing import Measurements, windows
 
@@ -106,6 +108,30 @@ def test_robot_log_to_policy_draws_by_seed(monkeypatch):
     assert drawn == [robot(seed).truth() for seed in range(12)]
     assert len(set(drawn)) == 12
     assert len({robot(seed)._inside[1].label for seed in range(12)}) == 3
+
+
+def test_close_the_loop_names_what_is_in_the_target(monkeypatch, tmp_path, capsys):
+    transfer = load("transfer_double_pendulum", monkeypatch)
+    example = load("close_the_loop", monkeypatch)
+    small = {"policy_kwargs": {"net_arch": [16]}, "batch_size": 16, "buffer_size": 1_000, "learning_starts": 300}
+    agent = SAC("MlpPolicy", transfer.source(), seed=0, device="cpu", **small).learn(300)
+    agent.save(tmp_path / "source_0.zip")
+    agent.save_replay_buffer(tmp_path / "source_0_data.pkl")
+    trace = closing.trace
+    monkeypatch.setattr(closing, "trace", lambda *a, **k: trace(*a, **{**k, "candidates": ["coulomb_friction"]}))
+    monkeypatch.setattr(closing, "FRESH", 25)
+    monkeypatch.setattr(sys, "argv", ["close_the_loop.py", "--steps", "202", "--out", str(tmp_path)])
+    example.main()
+    true = {effect.label: effect.values for effect in example.shifted("double-pendulum", "undeclared", 0)}
+    found = {effect.label: effect.values for effect in load_corrected(tmp_path).effects}
+    assert set(found) == set(true)
+    assert all(found[label] == pytest.approx(true[label], rel=0.01) for label in true)
+    out = capsys.readouterr().out
+    assert out.index("verdict:") < out.index("what the simulator did not know") < out.index("return, zero-shot")
+    assert "not there" not in out
+    curves = pd.read_csv(tmp_path / "closed_loop_0_0.csv")
+    assert curves.groupby("method").steps.max().to_dict() == {"RPTO, loop closed": 202, "SAC, fine-tuned": 202}
+    assert (tmp_path / "closed_loop.png").exists()
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py")))
