@@ -87,11 +87,7 @@ class Simulation:
         n, total, _ = drive.commands.shape
         steps = total - drive.before
         world = self._world(n)
-        active = [
-            (effect, values[:, s])
-            for effect, s in zip(self.effects, self.slices)
-            if effect.known or np.any((values[:, s] != self.null[s])[:, self.strength[s]])
-        ]
+        active = self.active(values)
         commands = filter_commands(active, drive.commands, self.model.opt.timestep)
         world.restore()
         world.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
@@ -112,6 +108,14 @@ class Simulation:
             bad = np.maximum.accumulate(bad, axis=1)
             out_q[bad], out_v[bad] = np.nan, np.nan
         return out_q, out_v
+
+    def active(self, values: np.ndarray) -> Active:
+        """The effects that do anything, with their parameters, of ``values`` (n, p)."""
+        return [
+            (effect, values[:, s])
+            for effect, s in zip(self.effects, self.slices)
+            if effect.known or np.any((values[:, s] != self.null[s])[:, self.strength[s]])
+        ]
 
     def sensing(self, values: np.ndarray) -> Active:
         """The effects on sensors with their parameters, of ``values`` (n, p)."""

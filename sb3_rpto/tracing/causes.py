@@ -11,7 +11,8 @@ from sb3_rpto.effects import Effect
 from sb3_rpto.effects.names import object_id
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.figures import AFTER, BEFORE, WITHOUT, Picture, draw, kind_of_runs, largest, left_out
-from sb3_rpto.tracing.residuals import REST, ForceResidual, force_residuals, summary
+from sb3_rpto.tracing.missing import missing_forces
+from sb3_rpto.tracing.residuals import REST, ForceResidual, summary
 
 if TYPE_CHECKING:
     from sb3_rpto.tracing.report import Report
@@ -82,9 +83,9 @@ def residual_of(report: Report, effect: Effect) -> Picture | None:
     sign = ", times the direction of motion (below zero it brakes)" if level else ""
     caption = (
         f"Each dot is one sample of the {kind_of_runs(report)} runs: the force that the motion needed and the model "
-        f"does not know{sign}, by inverse dynamics. The line joins medians: where it changes with {cause}, something "
-        "is missing; flat at zero, nothing is. On the left other effects are missing too, in the middle this one "
-        "alone. For the eye only: decisions are made on predictions."
+        f"does not know{sign}, {wording.means(report.data)}. The line joins medians: where it changes with {cause}, "
+        "something is missing; flat at zero, nothing is. On the left other effects are missing too, in the middle this "
+        "one alone. For the eye only: decisions are made on predictions."
     )
     title = (
         f"{effect.label}: missing force of {wording.dof_name(model, dof)} against {cause}, RMS "
@@ -99,7 +100,7 @@ def _without(report: Report, effect: Effect) -> list[ForceResidual]:
     for known, part in zip(report.simulation.effects, report.simulation.slices):
         if known.label == effect.label:
             values[part] = report.simulation.null[part]
-    return force_residuals(report.simulation, values, report.data)
+    return missing_forces(report.simulation, values, report.data)
 
 
 def standard_residuals(report: Report) -> Picture | None:
@@ -120,8 +121,9 @@ def standard_residuals(report: Report) -> Picture | None:
 
     caption = (
         f"Each dot is one sample of the {kind_of_runs(report)} runs: the force that the motion needed and the fitted "
-        "model does not know, by inverse dynamics. The line joins medians: flat at zero where the model lacks nothing "
-        "that depends on the axis below. Noise of differentiated positions spreads the dots. For the eye only."
+        f"model does not know, {wording.means(report.data)}. The line joins medians: flat at zero where the model "
+        "lacks nothing that depends on the axis below. Noise of differentiated positions, where there is some, spreads "
+        "the dots. For the eye only."
     )
     caption += left_out(len(dofs), len(shown))
     return Picture(

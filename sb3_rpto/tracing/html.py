@@ -210,9 +210,9 @@ def _forces(report: Report) -> str:
     lines = [
         _table(header, rows, numbers=(2, 3, 4)),
         _note(
-            "The force that the motion needed and the model does not know, away from rest. Noise of differentiated "
-            "positions is part of it. The learnable share is what a small regressor predicts on unseen stretches: what "
-            "a learned correction could still take away."
+            f"The force that the motion needed and the model does not know, {wording.means(report.data)}, away from "
+            "rest. Noise of differentiated positions, where there is some, is part of it. The learnable share is what "
+            "a small regressor predicts on unseen stretches: what a learned correction could still take away."
         ),
     ]
     shown = [causes.residual_of(report, t.effect) for t in report.effects[:FIGURES]]

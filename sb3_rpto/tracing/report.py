@@ -171,7 +171,8 @@ class Report:
         lines += ["", f"error on {tested}: RMSE [95 % interval, of whole runs their range]"]
         lines += wording.aligned(self._errors())
         if self.residuals_before and wording.scalar_dofs(self.simulation.model):
-            lines += ["", "missing force by inverse dynamics, RMS; share of the rest that a small regressor predicts"]
+            by = wording.means(self.data)
+            lines += ["", f"missing force {by}, RMS; share of the rest that a small regressor predicts"]
             lines += wording.aligned(self._forces())
         idle = [[c.label, c.reason] for c in self.candidates if c.status == "not excited"]
         if idle:

@@ -1,4 +1,4 @@
-"""The generalised force that a model lacks, by inverse dynamics: for plots, scales, screening; never for decisions."""
+"""The generalised force that a model lacks, by inverse dynamics: for plots and scales; never for decisions."""
 
 from __future__ import annotations
 
@@ -80,11 +80,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     for column, dof in enumerate(velocity_addresses(nominal, data)):
         if data.whole_states or dof not in dof_of.values():  # quaternions are not differentiated
             qvel[:, dof] = low(np.interp(time, e.time, e.qvel[:, column]))
-    active = [
-        (effect, values[None, s])
-        for effect, s in zip(simulation.effects, simulation.slices)
-        if effect.known or np.any((values[s] != simulation.null[s])[simulation.strength[s]])
-    ]
+    active = simulation.active(values[None])
     for effect, x in reversed([pair for pair in active if pair[0].senses]):
         _undo_sensor(effect, np.repeat(x, len(time), axis=0), time, qpos, qvel)
     qacc = np.gradient(qvel, h, axis=0)

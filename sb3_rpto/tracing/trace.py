@@ -28,11 +28,12 @@ from sb3_rpto.tracing.concentrate import NOTHING
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Loss, Problem
 from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.missing import missing_forces
 from sb3_rpto.tracing.model_checks import doubts
 from sb3_rpto.tracing.origin import origin
 from sb3_rpto.tracing.prepare import Progress, SetUp, prepare
 from sb3_rpto.tracing.report import Candidate, Report, Traced
-from sb3_rpto.tracing.residuals import force_residuals, learnable_share, summary
+from sb3_rpto.tracing.residuals import learnable_share, summary
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.search import Found, find
 from sb3_rpto.tracing.select import Selection, Selector
@@ -129,8 +130,8 @@ def trace(
         findings.append(Finding("split", "test runs", message))
     # What an equality constraint transmits is not known from the motion.
     tied = simulation.model.neq > 0
-    residuals_before = [] if tied else force_residuals(simulation, before.values, data)
-    residuals_after = [] if tied else force_residuals(simulation, final, data)
+    residuals_before = [] if tied else missing_forces(simulation, before.values, data)
+    residuals_after = [] if tied else missing_forces(simulation, final, data)
     unknown = np.full(simulation.model.nv, np.nan)  # where all runs are too short to differentiate
     verdict = judge(found.before, found.after, bool(selection.model.effects))
     floor = noise_floor(simulation, final, data, sigma, seed)

@@ -11,6 +11,7 @@ import numpy as np
 from sb3_rpto.effects import Effect
 from sb3_rpto.effects.names import SCALAR_JOINTS, object_id, object_names
 from sb3_rpto.effects.units import joint_of
+from sb3_rpto.tracing.measurements import Measurements
 
 #: For each verdict what it means, and what it does not mean.
 VERDICTS = {
@@ -33,6 +34,11 @@ VERDICTS = {
         "Effects that are listed all the same lower the error and are not claimed as the explanation.",
     ),
 }
+
+
+def means(data: Measurements) -> str:
+    """How a missing force was found, see :func:`sb3_rpto.tracing.missing.missing_forces`."""
+    return "from one sample to the next" if data.exact else "by inverse dynamics"
 
 
 def dofs_of(effect: Effect, model: mujoco.MjModel) -> list[int]:
