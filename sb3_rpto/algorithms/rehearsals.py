@@ -9,7 +9,7 @@ import numpy as np
 from sb3_rpto.algorithms.source import copied
 from sb3_rpto.algorithms.worlds import check_finite
 from sb3_rpto.dynamics.physical import PhysicalDynamics
-from sb3_rpto.envs.stance import StandingEnv
+from sb3_rpto.effects.stance import StandingEnv
 
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.looping import Looping

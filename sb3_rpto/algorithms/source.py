@@ -22,7 +22,7 @@ from sb3_rpto.dynamics.base import Dynamics, Prediction
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
-from sb3_rpto.envs.stance import StandingEnv
+from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.envs.state import copy_env, restore_state, save_state
 
 RolloutStart = Literal["target", "source", "mix"]

@@ -20,6 +20,7 @@ def memoryless(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether an actuator's force follows from its command and its joint alone: no activation, delay or tendon."""
     return bool(
         model.actuator_trntype[actuator] in _JOINT
+        and model.actuator_ctrlnum[actuator] == 1
         and model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
         and model.actuator_gaintype[actuator] in _GAINS
         and model.actuator_biastype[actuator] in _BIASES
@@ -29,14 +30,42 @@ def memoryless(model: mujoco.MjModel, actuator: int) -> bool:
 
 def drivers(model: mujoco.MjModel, joint: int) -> list[int]:
     """The actuators that act on a joint itself, not through a tendon or a site."""
-    return [a for a in range(model.nu) if model.actuator_trntype[a] in _JOINT and model.actuator_trnid[a, 0] == joint]
+    actuators = range(model.nactuator)
+    return [a for a in actuators if model.actuator_trntype[a] in _JOINT and model.actuator_trnid[a, 0] == joint]
 
 
 def motors(model: mujoco.MjModel, joint: int) -> list[int] | None:
-    """The actuators on a joint; None where what they do cannot be told from their commands."""
+    """The actuators on a joint; None where what they do is not told by :func:`motor_torque`."""
     on = drivers(model, joint)
-    through_tendons = any(model.actuator_trntype[a] not in _JOINT for a in range(model.nu))
-    return None if through_tendons or not all(memoryless(model, a) for a in on) else on
+    others = any(_moves_otherwise(model, a, joint) for a in range(model.nactuator))
+    balanced = bool(model.jnt_actgravcomp[joint]) and bool(model.body_gravcomp.any())
+    return None if others or balanced or not all(memoryless(model, a) for a in on) else on
+
+
+def _moves_otherwise(model: mujoco.MjModel, actuator: int, joint: int) -> bool:
+    """Whether an actuator may move a joint by other ways than as its own: a tendon, a site, a body."""
+    if model.actuator_trntype[actuator] in _JOINT:
+        return False
+    if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_TENDON:
+        return True
+    joints = _joints_of(model, actuator)
+    return joints is None or joint in joints
+
+
+def _joints_of(model: mujoco.MjModel, actuator: int) -> list[int] | None:
+    """The joints of an actuator's fixed tendon; None of a spatial one, which may move any."""
+    tendon = model.actuator_trnid[actuator, 0]
+    wraps = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+    if (model.wrap_type[wraps] != mujoco.mjtWrap.mjWRAP_JOINT).any():
+        return None
+    return [int(joint) for joint in model.wrap_objid[wraps]]
+
+
+def driven(model: mujoco.MjModel) -> set[int]:
+    """The joints that an actuator drives, by itself or through a fixed tendon."""
+    tendons = [a for a in range(model.nactuator) if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON]
+    on = {joint for joint in range(model.njnt) if drivers(model, joint)}
+    return on.union(*(_joints_of(model, a) or () for a in tendons))
 
 
 def motor_torque(world: World, actuator: int, dof: int, adr: int) -> np.ndarray:
@@ -51,13 +80,17 @@ def motor_torque(world: World, actuator: int, dof: int, adr: int) -> np.ndarray:
     :param adr: its address in qpos
     """
     model = world.model
+    if _is_off(model, actuator):
+        return np.zeros(world.n)
     gear = world.field("actuator_gear")[:, actuator, 0]
     length, speed = gear * world.qpos[:, adr], gear * world.qvel[:, dof]
-    u = world.ctrl[:, actuator]
-    if model.actuator_ctrllimited[actuator]:
+    u = world.ctrl[:, model.actuator_ctrladr[actuator]]
+    if model.actuator_ctrllimited[actuator] and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
         limits = world.field("actuator_ctrlrange")[:, actuator]
         u = np.clip(u, limits[:, 0], limits[:, 1])
-    force = _affine(world.field("actuator_gainprm")[:, actuator], length, speed) * u
+    gain = world.field("actuator_gainprm")[:, actuator]
+    affine = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_AFFINE
+    force = (_affine(gain, length, speed) if affine else gain[:, 0]) * u
     if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
         force = force + _affine(world.field("actuator_biasprm")[:, actuator], length, speed)
     if model.actuator_forcelimited[actuator]:
@@ -69,21 +102,25 @@ def motor_torque(world: World, actuator: int, dof: int, adr: int) -> np.ndarray:
 def joint_torque(world: World, actuators: list[int] | None, dof: int, adr: int) -> np.ndarray:
     """Sum of the actuators' generalised forces at a joint, (n,), within what its ``actuatorfrcrange`` lets through.
 
-    :param actuators: from :func:`motors`; None: the sum of the substep before
+    :param actuators: from :func:`motors`; None: MuJoCo's own sum, of the last :meth:`World.evaluate`
     """
     if actuators is None:
-        return world.actuation[:, dof]
-    return _through(world, _sum(world, actuators, dof, adr), dof)
+        return world.actuation[:, dof] - world.loss[:, dof]
+    return _through(world, _sum(world, actuators, dof, adr) - world.loss[:, dof], dof)
 
 
 def joint_loss(world: World, actuators: list[int], dof: int, adr: int, loss: np.ndarray) -> np.ndarray:
     """What a joint loses, (n,), where its actuators' sum is less by ``loss``: nothing of what its limit takes anyway.
 
+    It counts as lost in this substep from then on (``world.loss``).
+
     :param actuators: all that act on the joint
     """
+    before = world.loss[:, dof].copy()
+    world.loss[:, dof] += loss
     if not world.model.jnt_actfrclimited[world.model.dof_jntid[dof]]:
         return loss
-    total = _sum(world, actuators, dof, adr)
+    total = _sum(world, actuators, dof, adr) - before
     return _through(world, total, dof) - _through(world, total - loss, dof)
 
 
@@ -100,6 +137,12 @@ def _through(world: World, torque: np.ndarray, dof: int) -> np.ndarray:
     return np.clip(torque, limits[:, 0], limits[:, 1])
 
 
+def _is_off(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether the model's options switch an actuator off."""
+    group = int(model.actuator_group[actuator])
+    all_off = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    return bool(all_off or (0 <= group <= 30 and model.opt.disableactuator >> group & 1))
+
+
 def _affine(parameters: np.ndarray, length: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    # A fixed gain has zeros for the terms in length and speed.
     return parameters[:, 0] + parameters[:, 1] * length + parameters[:, 2] * speed

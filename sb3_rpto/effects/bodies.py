@@ -91,17 +91,14 @@ class LinkLength(Effect):
         return [name for name in have if not held_by_constraint(model, ids[name])]
 
     def bind(self, model: mujoco.MjModel) -> None:
-        """As in :class:`Effect`.
-
-        :raises ValueError: the body has no capsule, or a connect or weld names it
-        """
+        """As in :class:`Effect`; looks up the length too."""
         super().bind(model)
-        held = held_by_constraint(model, self.index)
-        if held:
-            raise ValueError(f"link_length cannot sit on {self.on!r}: {held} names the body; tie it by sites (site1=)")
         self.nominal = link_length(model, self.index)
-        if self.nominal == 0:
-            raise ValueError(f"link_length cannot sit on {self.on!r}: the body has no capsule to stretch")
+
+    def why_not(self, model: mujoco.MjModel) -> str:
+        """As in :class:`Effect`."""
+        held = held_by_constraint(model, self.index)
+        return f"{held} names the body; tie it by sites (site1=)" if held else "the body has no capsule to stretch"
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Stretch the link."""

@@ -22,11 +22,14 @@ from sb3_rpto.effects.mjcf import restore, rounded, write_mjcf
 from sb3_rpto.effects.model import ModelSource, differing, load_model, same_layout
 from sb3_rpto.effects.names import near
 from sb3_rpto.effects.simulation import Simulation, prepare
+from sb3_rpto.effects.stance import StandingEnv, nominal_heights
 from sb3_rpto.effects.units import units_at
 from sb3_rpto.effects.world import LiveWorld
 from sb3_rpto.effects.wrapper import CorrectedEnv, active, own
 
 FORMAT = 1
+#: What reading a file raises that holds other things than :func:`save_corrected` writes.
+_DAMAGED = (KeyError, TypeError, AttributeError, IndexError)
 _HOOKS = ("act", "command", "observe", "late")
 
 
@@ -37,10 +40,12 @@ class Corrected:
     :param model: with the numbers of every effect that ``model.xml`` holds
     :param effects: all effects, as changes of the **nominal** model; those for which :func:`carried_by` says
         ``"mjcf"`` are in ``model`` already
+    :param heights: at which the nominal robot stands, see :func:`~sb3_rpto.effects.stance.nominal_heights`
     """
 
     model: mujoco.MjModel
     effects: list[Effect]
+    heights: tuple[float, float] | None = None
 
     def simulation(self, nthread: int = 0) -> Simulation:
         """Many of it side by side; its effects, and :meth:`Simulation.values`, are those that its model does not hold.
@@ -52,13 +57,15 @@ class Corrected:
     def apply(self, env: gym.Env) -> CorrectedEnv:
         """Put all effects into ``env``, which has the nominal model; one that has :attr:`model` lacks the others alone.
 
+        A walker whose body they change stands on its feet from the next reset on.
+
         :param env: a gymnasium MuJoCo environment; it is changed. :func:`sb3_rpto.envs.corrected.apply_effects` with
             :attr:`effects` leaves it alone
         """
         effects, given = self.effects, env.unwrapped.model  # type: ignore[attr-defined]
         if same_layout(given, self.model) and not differing(given, self.model, rounded=True):
-            effects = [e for e in effects if carried_by(e) == "wrapper"]
-        return CorrectedEnv(env, effects)
+            return StandingEnv(env, [e for e in effects if carried_by(e) == "wrapper"], self.heights)
+        return StandingEnv(env, effects)
 
 
 def carried_by(effect: Effect) -> Literal["mjcf", "wrapper"]:
@@ -109,6 +116,7 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
         "mujoco": mujoco.__version__,
         "model": {"file": "model.xml", "sha256": hashlib.sha256(text.encode()).hexdigest()},
         "effects": [_describe(effect, nominal) for effect in own(effects, nominal)],
+        "heights": nominal_heights(nominal),
         "exact": rounded(mujoco.MjModel.from_xml_string(text, assets), model),
     }
     folder = Path(folder)
@@ -145,8 +153,8 @@ def load_corrected(folder: str | os.PathLike[str]) -> Corrected:
             raise FileNotFoundError(f"{folder} holds no corrected simulator: {file.name} is missing; save it again")
     try:
         stored = json.loads(path.read_bytes())
-        version, digest = stored["format"], stored["model"]["sha256"]
-    except (ValueError, KeyError, TypeError) as error:
+        version, digest, made_by = stored["format"], stored["model"]["sha256"], stored["mujoco"]
+    except (ValueError, *_DAMAGED) as error:
         raise ValueError(f"{path} does not describe a corrected simulator; save it again") from error
     if version != FORMAT:
         raise ValueError(f"{path} has format {version!r}, this version of sb3_rpto reads {FORMAT}; save it again")
@@ -155,14 +163,18 @@ def load_corrected(folder: str | os.PathLike[str]) -> Corrected:
             f"{xml} is not the file that effects.json was written for; save both again, or load an edited model.xml "
             "by itself"
         )
-    if stored["mujoco"] != mujoco.__version__:
+    if made_by != mujoco.__version__:
         warnings.warn(
-            f"{folder} was saved with MuJoCo {stored['mujoco']}; under {mujoco.__version__} it may differ by rounding",
+            f"{folder} was saved with MuJoCo {made_by}; under {mujoco.__version__} it may differ by rounding",
             stacklevel=2,
         )
-    model = mujoco.MjModel.from_xml_path(str(xml))
-    restore(model, stored["exact"])
-    return Corrected(model, [_rebuild(entry, model, entry.get("nominal")) for entry in stored["effects"]])
+    model, heights = mujoco.MjModel.from_xml_path(str(xml)), stored.get("heights")
+    try:
+        restore(model, stored["exact"])
+        effects = [_rebuild(entry, model, entry.get("nominal")) for entry in stored["effects"]]
+        return Corrected(model, effects, None if heights is None else (float(heights[0]), float(heights[1])))
+    except _DAMAGED as error:
+        raise ValueError(f"{path} does not describe a corrected simulator; save it again") from error
 
 
 def read_effects(path: str | os.PathLike[str], model: mujoco.MjModel) -> list[Effect]:
@@ -177,7 +189,7 @@ def read_effects(path: str | os.PathLike[str], model: mujoco.MjModel) -> list[Ef
         stored = json.loads(Path(path).read_bytes())
         entries = stored["effects"] if isinstance(stored, dict) else stored
         return [_rebuild(entry, model) for entry in entries]
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, *_DAMAGED) as error:
         raise ValueError(f"{path} does not describe effects; give the effects.json of an earlier trace") from error
 
 

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects.effect import Effect, Parameter, register
+from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.world import World
 
 LONGEST_DELAY = 0.2  # s; a longer delay is a fault of the log
@@ -82,7 +83,8 @@ class CommandGain(Effect):
         """Actuators whose force is linear in their gain parameters."""
         # Plain numbers: NumPy's integers are not found among MuJoCo's enumerators.
         linear = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
-        return [name for i, name in enumerate(super().places(model)) if model.actuator_gaintype[i] in linear]
+        gains = dict(zip(object_names(model, "actuator"), model.actuator_gaintype))
+        return [name for name in super().places(model) if gains[name] in linear]
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Scale the gain."""

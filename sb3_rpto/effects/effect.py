@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, get_args
 
@@ -88,8 +88,10 @@ class Effect:
     excite: ClassVar[str] = "larger and faster motion"
     #: declared parameters of the same object that are the same number, e.g. ``("damping",)``
     same: ClassVar[tuple[str, ...]] = ()
-    #: where in the chain of command effects it stands; smaller is nearer the controller
+    #: where in the chain of command effects it stands; smaller is nearer the controller. Of forces: smaller acts first
     order: ClassVar[int] = 0
+    #: whether :meth:`act` reads ``world.actuation``, which costs an evaluation in every substep
+    asks_simulator: bool = False
     #: whether the model has it from the start: fitted like the others, and nothing asks whether it is needed
     known: bool = False
 
@@ -128,10 +130,26 @@ class Effect:
             raise ValueError(f"known: {self!r} does nothing; give the values that are known, or leave it to the search")
         made = self.with_values(self.values)
         made.known = True
-        made.parameters = tuple(  # type: ignore[misc]
-            replace(p, null=float(value)) for p, value in zip(self.parameters, self.values)
-        )
+        made._begin_at(self.values)
         return made
+
+    def _begin_at(self, nulls: Sequence[float] | np.ndarray) -> None:
+        self.parameters = tuple(  # type: ignore[misc]
+            replace(p, null=float(null)) for p, null in zip(type(self).parameters, nulls)
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the parameters of a known effect, the class's with other nulls: their sizes are functions."""
+        if not self.known:
+            return dict(vars(self))
+        kept = {name: value for name, value in vars(self).items() if name != "parameters"}
+        return {**kept, "nulls": [p.null for p in self.parameters]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        nulls = state.pop("nulls", None)
+        vars(self).update(state)
+        if nulls is not None:
+            self._begin_at(nulls)
 
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
@@ -144,18 +162,33 @@ class Effect:
         if cls.place == "body":
             names = object_names(model, "body")
             return [names[i] for i in range(model.nbody) if model.body_weldid[i] and model.body_mass[i] > 0]
-        return object_names(model, cls.place)
+        names = object_names(model, cls.place)
+        if cls.place == "actuator":
+            return [names[i] for i in range(model.nactuator) if model.actuator_ctrlnum[i] == 1]
+        return names
 
     def bind(self, model: mujoco.MjModel) -> None:
-        """Look up the ids of the place: ``self.dof`` and ``self.adr`` of a joint, ``self.index`` of anything else.
+        """Look up the ids of the place: ``self.dof`` and ``self.adr`` of a joint, ``self.index`` of anything.
 
-        :raises ValueError: the model has no such object
+        ``self.ctrl`` is the address of an actuator's command.
+
+        :raises ValueError: the model has no such object, or the effect cannot sit on it, see :meth:`places`
         """
         if self.place in ("joint", "sensor"):
             joint = object_id(model, "joint", self.on)
             self.index, self.dof, self.adr = joint, int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
         elif self.place != "world":
             self.index = object_id(model, self.place, self.on)
+        if self.place == "actuator":
+            self.ctrl = int(model.actuator_ctrladr[self.index])
+        # Which geoms touch, and whether there is a fluid or gravity, follows from numbers that other effects change.
+        if self.place not in ("geom", "world") and self.on not in self.places(model):
+            raise ValueError(f"{self.kind} cannot sit on {self.place} {self.on!r}: {self.why_not(model)}")
+
+    def why_not(self, model: mujoco.MjModel) -> str:
+        """What to say of an object that :meth:`places` leaves out."""
+        places = self.places(model)
+        return f"it can on {', '.join(places[:12])}{' …' if len(places) > 12 else ''}" if places else "it can on none"
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Change fields of the model, once before a rollout."""

@@ -105,6 +105,7 @@ class DCMotor(Effect):
         Parameter("inverse_speed", "s/rad", lambda s: 1.2 / s.velocity, lower=0.0),
     )
     equation = "|tau| <= (1 - inverse_speed |qd| [tau qd > 0]) / inverse_stall"
+    order = -1  # before what depends on the torque that is left
     excite = "full torque at high speed"
 
     @classmethod
@@ -113,24 +114,21 @@ class DCMotor(Effect):
         names = object_names(model, "actuator")
         return [
             names[a]
-            for a in range(model.nu)
+            for a in range(model.nactuator)
             if memoryless(model, a) and model.jnt_type[model.actuator_trnid[a, 0]] in SCALAR_JOINTS
         ]
 
     def bind(self, model: mujoco.MjModel) -> None:
-        """As in :class:`Effect`; looks up the joint too.
-
-        :raises ValueError: the actuator is not on a hinge or slide, or has activation or delay
-        """
+        """As in :class:`Effect`; looks up the joint too."""
         super().bind(model)
-        if self.on not in self.places(model):
-            raise ValueError(
-                f"dc_motor cannot sit on {self.on!r}: it needs a motor on a hinge or slide, without memory"
-            )
         joint = model.actuator_trnid[self.index, 0]
         self.dof, self.adr = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
         # Where those beside it have memory, what they do is not known now: the joint's limit is then of this one alone.
         self.beside = motors(model, int(joint)) or [self.index]
+
+    def why_not(self, model: mujoco.MjModel) -> str:
+        """As in :class:`Effect`."""
+        return "it needs a motor on a hinge or slide, without memory"
 
     def act(self, world: World, x: np.ndarray) -> None:
         """Take away what the motor cannot give."""

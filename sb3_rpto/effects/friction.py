@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.actuation import drivers, joint_torque, motors
+from sb3_rpto.effects.actuation import driven, joint_torque, motors
 from sb3_rpto.effects.effect import Effect, Parameter, Scales, register
 from sb3_rpto.effects.names import hinges, object_names
 from sb3_rpto.effects.world import World
@@ -98,6 +98,7 @@ class AsymmetricDamping(Effect):
     r"""Viscous friction that depends on the direction: :math:`-c_+ \max(\dot q, 0) - c_- \min(\dot q, 0)`.
 
     Friction of machines is often unequal in the two directions (Armstrong-Hélouvry, Dupont & Canudas de Wit 1994).
+    It acts explicitly: a coefficient above twice the joint's inertia over the time step makes energy.
     """
 
     kind = "asymmetric_damping"
@@ -125,13 +126,14 @@ class _LoadDependent(Effect):
     def places(cls, model: mujoco.MjModel) -> list[str]:
         """Joints that a motor drives."""
         names = object_names(model, "joint")
-        driven = {names[joint] for joint in range(model.njnt) if drivers(model, joint)}
-        return [name for name in super().places(model) if name in driven]
+        moved = {names[joint] for joint in driven(model)}
+        return [name for name in super().places(model) if name in moved]
 
     def bind(self, model: mujoco.MjModel) -> None:
         """As in :class:`Effect`; looks up the motors too."""
         super().bind(model)
         self.motors = motors(model, self.index)
+        self.asks_simulator = self.motors is None
 
     def torque(self, world: World) -> np.ndarray:
         """The motors' torque at the joint, (n,)."""

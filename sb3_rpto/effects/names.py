@@ -9,7 +9,7 @@ _KINDS = {
     "joint": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
     "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
     "geom": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
-    "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
+    "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nactuator"),
 }
 SCALAR_JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 

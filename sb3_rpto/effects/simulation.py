@@ -153,7 +153,7 @@ class Simulation:
     ) -> None:
         """Step through all commands and write what was reached after the start."""
         steps = commands.shape[1]
-        acting = [(e, x) for e, x in active if e.overrides("act")]
+        acting = pushing(active)
         if acting or enabled is not None:
             switch = Switch(world, enabled)
             for k in range(steps):
@@ -219,13 +219,27 @@ def prepare(world: World, active: Active) -> None:
     world.settle()
 
 
+def pushing(active: Active) -> Active:
+    """The effects that act in every substep, in the order in which they do."""
+    return sorted((pair for pair in active if pair[0].overrides("act")), key=lambda pair: pair[0].order)
+
+
 def push(world: World, acting: Active) -> None:
-    """Collect and apply the forces of one substep."""
-    world.force[:] = 0
-    world.friction[:] = 0
+    """Collect and apply the forces of one substep.
+
+    :param acting: from :func:`pushing`
+    """
+    collect(world, acting)
+    world.commit()
+
+
+def collect(world: World, acting: Active) -> None:
+    """Collect the forces of one substep."""
+    world.force[:], world.friction[:], world.loss[:] = 0, 0, 0
+    if any(effect.asks_simulator for effect, _ in acting):
+        world.evaluate()
     for effect, x in acting:
         effect.act(world, x)
-    world.commit()
 
 
 def filter_commands(active: Active, commands: np.ndarray, dt: float) -> np.ndarray:
@@ -236,7 +250,7 @@ def filter_commands(active: Active, commands: np.ndarray, dt: float) -> np.ndarr
     out = commands.copy()
     for effect, x in chain:
         memory: dict[str, Any] = {}
-        column = out[:, :, effect.index]
+        column = out[:, :, effect.ctrl]
         for k in range(column.shape[1]):
             column[:, k] = effect.command(column[:, k], x, memory, dt)
     return out

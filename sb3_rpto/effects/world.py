@@ -24,13 +24,14 @@ class World(ABC):
     qvel: np.ndarray  # (n, nv)
     ctrl: np.ndarray  # (n, nu)
     time: np.ndarray  # (n,)
-    actuation: np.ndarray  # (n, nv), the actuators' generalised force in the substep before
+    actuation: np.ndarray  # (n, nv), the actuators' generalised force at the last evaluate
 
     def __init__(self, model: mujoco.MjModel, n: int) -> None:
         self.model = model
         self.n = n
         self.force = np.zeros((n, model.nv))  # N·m or N, added to the generalised forces
         self.friction = np.zeros((n, model.nv))  # N·m or N, added to the level of dry friction
+        self.loss = np.zeros((n, model.nv))  # N·m or N, what motors do not give of their torques
         self._nominal: dict[str, np.ndarray] = {}
         self._base_friction: np.ndarray | None = None  # (n, nv), before the substep's own
         self._dry = np.zeros(model.nv, dtype=bool)  # joints whose friction has varied since settle
@@ -91,6 +92,10 @@ class World(ABC):
             np.maximum(self._base_friction + self.friction, 0.0, out=self._live("dof_frictionloss"))
 
     @abstractmethod
+    def evaluate(self) -> None:
+        """Compute :attr:`actuation` for the present states and commands."""
+
+    @abstractmethod
     def _applied(self) -> np.ndarray:
         """The (n, nv) live qfrc_applied."""
 
@@ -111,6 +116,10 @@ class BatchWorld(World):
     def derive(self) -> None:
         """As in :class:`World`."""
         self.batch.set_const()
+
+    def evaluate(self) -> None:
+        """As in :class:`World`."""
+        self.batch.forward()
 
     def _applied(self) -> np.ndarray:
         return self.batch.bind("qfrc_applied")
@@ -159,6 +168,10 @@ class LiveWorld(World):
         """As in :class:`World`."""
         # mj_setConst writes the data at the reference pose: a scratch copy keeps the environment where it is.
         mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+
+    def evaluate(self) -> None:
+        """As in :class:`World`."""
+        mujoco.mj_forward(self.model, self.data)
 
     def _applied(self) -> np.ndarray:
         return self.data.qfrc_applied[None]

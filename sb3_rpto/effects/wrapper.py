@@ -15,7 +15,7 @@ from gymnasium.utils import EzPickle, RecordConstructorArgs
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.sensors import ago
-from sb3_rpto.effects.simulation import Active, prepare, push
+from sb3_rpto.effects.simulation import Active, prepare, push, pushing
 from sb3_rpto.effects.world import LiveWorld
 
 # Where gymnasium's MujocoEnv steps its physics, and what an environment without that method may offer instead.
@@ -44,7 +44,7 @@ def active(effects: Sequence[Effect]) -> Active:
     return [
         (e, e.values[None])
         for e in effects
-        if isinstance(e, Declared) or any(v != p.null for p, v in zip(e.parameters, e.values) if not p.shape)
+        if e.known or isinstance(e, Declared) or any(v != p.null for p, v in zip(e.parameters, e.values) if not p.shape)
     ]
 
 
@@ -123,7 +123,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         stack = corrections(self)
         self._wanted = set()
         for seam, answer, wanted in (
-            (self._seam, self._simulate, any(layer._acting or layer._commanding or layer._latest() for layer in stack)),
+            (self._seam, self._simulate, any(x._acting or x._commanding or _ages(x._sensing) for x in stack)),
             ("_get_obs", self._observe, any(layer._sensing for layer in stack)),
         ):
             vars(base).pop(seam, None)
@@ -173,7 +173,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         model, data = base.model, base.data
         self._called.add(self._seam)
         stack = corrections(self)
-        acting = [pair for layer in reversed(stack) for pair in layer._acting]
+        acting = pushing([pair for layer in reversed(stack) for pair in layer._acting])
         commanding = [
             (*pair, memory) for layer in stack for pair, memory in zip(layer._commanding, layer._memory, strict=True)
         ]
@@ -183,13 +183,14 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
                 world.rough(effect.dof)
         world.settle()
         command, dt, others = np.array(ctrl, dtype=float), model.opt.timestep, data.qfrc_applied.copy()
-        kept = math.ceil(max(layer._latest() for layer in stack) / dt) + 1
+        ages = _ages([pair for layer in stack for pair in layer._sensing])
+        kept = math.ceil(max(ages.values(), default=0.0) / dt) + 1
         if kept > 1 and not self._past:
             self._past = [(data.qpos.copy(), data.qvel.copy())]
         for _ in range(n_frames):
             sent = command.copy()
             for effect, x, memory in commanding:
-                sent[effect.index] = effect.command(np.array([sent[effect.index]]), x, memory, dt)[0]
+                sent[effect.ctrl] = effect.command(np.array([sent[effect.ctrl]]), x, memory, dt)[0]
             data.ctrl[:] = sent
             if acting:
                 push(world, acting)
@@ -210,12 +211,10 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         data = base.data
         qpos, qvel = data.qpos.copy(), data.qvel.copy()
         sensing = [pair for layer in reversed(corrections(self)) for pair in layer._sensing]
-        for effect, x in sensing:
-            steps = effect.late(x) / base.model.opt.timestep
-            if steps.any() and self._past:
-                q = np.array([[q[effect.adr] for q, _ in self._past]])
-                v = np.array([[v[effect.dof] for _, v in self._past]])
-                (data.qpos[effect.adr],), (data.qvel[effect.dof],) = ago(steps, q, v)
+        for (adr, dof), delay in _ages(sensing).items() if self._past else ():
+            q = np.array([[q[adr] for q, _ in self._past]])
+            v = np.array([[v[dof] for _, v in self._past]])
+            (data.qpos[adr],), (data.qvel[dof],) = ago(np.array([delay / base.model.opt.timestep]), q, v)
         for effect, x in sensing:
             q, v = effect.observe(np.array([data.qpos[effect.adr]]), np.array([data.qvel[effect.dof]]), x)
             data.qpos[effect.adr], data.qvel[effect.dof] = q[0], v[0]
@@ -227,10 +226,6 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             return copy.deepcopy(type(base)._get_obs(base, *args, **kwargs))
         finally:
             data.qpos[:], data.qvel[:], data.sensordata[:] = qpos, qvel, readings
-
-    def _latest(self) -> float:
-        """The longest delay of these effects' sensors in s."""
-        return max((float(effect.late(x)[0]) for effect, x in self._sensing), default=0.0)
 
     def __getstate__(self) -> dict[str, Any]:
         """As gymnasium's own pickling of MuJoCo tasks: what makes a new one, without the state of the simulation."""
@@ -252,6 +247,16 @@ def corrections(env: gym.Env) -> list[CorrectedEnv]:
         if isinstance(env, CorrectedEnv):
             found.append(env)
         env = env.env
+    return found
+
+
+def _ages(sensing: Active) -> dict[tuple[int, int], float]:
+    """How late sensors are in s, by their joints' addresses in qpos and qvel; delays on one joint add up."""
+    found: dict[tuple[int, int], float] = {}
+    for effect, x in sensing:
+        if effect.late(x)[0] > 0:
+            place = effect.adr, effect.dof
+            found[place] = found.get(place, 0.0) + float(effect.late(x)[0])
     return found
 
 

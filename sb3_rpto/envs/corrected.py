@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import gymnasium as gym
 
 from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
-from sb3_rpto.envs.stance import StandingEnv
 from sb3_rpto.envs.state import copy_env
 
 

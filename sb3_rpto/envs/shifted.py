@@ -13,9 +13,9 @@ from gymnasium.utils import RecordConstructorArgs
 
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect, from_json
+from sb3_rpto.effects.stance import Stance, StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.shifts import EnvShift, as_shift, number_names
-from sb3_rpto.envs.stance import Stance, StandingEnv
 
 
 def shift_effects(shift: EnvShift, env: gym.Env) -> list[Effect]:
@@ -50,7 +50,7 @@ class ShiftedEnv(StandingEnv):
         base: Any = env.unwrapped
         if not isinstance(getattr(base, "model", None), mujoco.MjModel):
             raise ValueError(f"{type(base).__name__} is neither a gymnasium MuJoCo environment nor a cart-pole")
-        self._stance = Stance(base)
+        self._stance, self._before = Stance(base), None
         CorrectedEnv.__init__(self, env, shift_effects(shift, env))
 
     def __getstate__(self) -> dict[str, Any]:

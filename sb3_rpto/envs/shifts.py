@@ -33,7 +33,7 @@ class EnvShift:
     :class:`~sb3_rpto.envs.cartpole.CartPoleParameters`.
 
     A walker that a shift has made taller or smaller stands at reset as it did before; see
-    :class:`~sb3_rpto.envs.stance.Stance`.
+    :class:`~sb3_rpto.effects.stance.Stance`.
 
     :param name: what it is called
     :param factors: of numbers by name, each > 0; where two names mean one number, both count

@@ -171,7 +171,7 @@ def _actuator(model: Any, dof: int, given: int | None) -> int:
     """The actuator whose command is shown: the given one, one at the joint, or the first."""
     if given is not None:
         return given
-    at = [a for a in range(model.nu) if model.actuator_trnid[a, 0] == model.dof_jntid[dof]]
+    at = [a for a in range(model.nactuator) if model.actuator_trnid[a, 0] == model.dof_jntid[dof]]
     return at[0] if at else 0
 
 

@@ -22,6 +22,8 @@ SPAN = 16
 """Samples over which velocity and change of position are compared."""
 CLEAR = 0.5
 """Another convention of rotations fits clearly when it leaves at most so much of what MuJoCo's leaves."""
+TURN, FAST = 2 * np.pi, 0.05
+"""A turn in rad; an angle is too fast for its samples where more than this share of its steps are about half a turn."""
 WINDOW = 9
 """Samples of the filter that differentiates positions."""
 
@@ -78,22 +80,28 @@ def jitter(time: np.ndarray) -> float:
     return float(np.quantile(np.abs(steps - median), 0.95)) / median
 
 
-def unwrap(angle: np.ndarray) -> tuple[np.ndarray, int]:
+def unwrap(angle: np.ndarray, change: np.ndarray | None = None) -> tuple[np.ndarray, int, bool]:
     """Undo the wrapping of an angle to one turn.
 
-    Only a signal that stays within one turn (and 1 % for rounding) and jumps by nearly a whole one (within a quarter
-    turn) is taken as wrapped.
+    Only a signal that stays within one turn (and 1 % for rounding) is taken as wrapped, where it jumps by nearly a
+    whole one (within a quarter turn), or by whole ones more than its velocity says.
 
     :param angle: in rad, shape (T,)
-    :return: the continuous angle, shape (T,), and the number of jumps removed
+    :param change: of the angle from each sample to the next by its measured velocity, shape (T - 1,); None without one
+    :return: the continuous angle, shape (T,), the number of jumps removed, and whether the motion is too fast for the
+        samples to tell them
     """
-    turn = 2 * np.pi
     steps = np.diff(angle)
-    jumps = np.where(np.abs(np.abs(steps) - turn) < turn / 4, np.sign(steps), 0.0)
+    if np.ptp(angle) > 1.01 * TURN:
+        return angle, 0, False
+    jumps = np.where(np.abs(np.abs(steps) - TURN) < TURN / 4, np.sign(steps), 0.0)
+    fast = float(np.mean(np.abs(np.abs(steps) - TURN / 2) < TURN / 4)) > FAST
+    if change is not None and np.abs(change).max(initial=0.0) > TURN / 4:
+        told = np.round((steps - change) / TURN)
+        if np.quantile(np.abs(steps - change - TURN * told), 0.95) < TURN / 8:
+            jumps, fast = told, False
     count = int(np.count_nonzero(jumps))
-    if count == 0 or np.ptp(angle) > 1.01 * turn:
-        return angle, 0
-    return angle - turn * np.concatenate([[0.0], np.cumsum(jumps)]), count
+    return angle - TURN * np.concatenate([[0.0], np.cumsum(jumps)]) if count else angle, count, fast
 
 
 def align_quaternions(quaternions: np.ndarray) -> int:
@@ -225,7 +233,20 @@ def velocity_slope(time: np.ndarray, position: np.ndarray, velocity: np.ndarray)
         return None
     span = min(SPAN, len(time) // 2)
     integral = cumulative_trapezoid(velocity, time, initial=0)
-    moved, said = (x[span:] - x[:-span] for x in (position, integral))
+    return _slope(*(x[span:] - x[:-span] for x in (position, integral)))
+
+
+def turning_slope(time: np.ndarray, quaternions: np.ndarray, velocity: np.ndarray) -> float | None:
+    """As :func:`velocity_slope`, of a measured angular velocity against the quaternions' change.
+
+    :param time: increasing times in s, shape (T,) with T >= 5
+    :param quaternions: unit ones, w first, neighbours of near sign, shape (T, 4)
+    :param velocity: in rad/s, shape (T, 3)
+    """
+    return _slope(angular_velocity(time, quaternions).ravel(), velocity.ravel())
+
+
+def _slope(moved: np.ndarray, said: np.ndarray) -> float | None:
     square, product = moved @ moved, moved @ said
     if product**2 <= 0.25 * square * (said @ said):
         return None

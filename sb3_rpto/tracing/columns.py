@@ -127,6 +127,8 @@ def _coordinates(joint: str, names: list[str]) -> list[str]:
 def _near(name: str) -> str:
     if name == "" or name.startswith("Unnamed"):
         return "an index that was saved with the table? Write it without one (pandas: index=False)"
+    if name in PREFIXES:
+        return f"write a column of shape (T,) for each object, '{name}.<name>'"
     for prefix in PREFIXES:
         if name.startswith(prefix) and len(name) > len(prefix) + 1 and not name[len(prefix)].isalnum():
             return f"did you mean '{prefix}.{name[len(prefix) + 1 :]}'?"

@@ -21,6 +21,8 @@ FINEST = 1e-10
 BURSTS, BURST = 0.1, 3.0
 #: Norms of quaternions may be off by so much.
 UNIT = 0.05
+#: Norms of quaternions are 1 but for rounding up to the first, and said to be off from the second on.
+ROUNDED, WORTH_SAYING = 1e-6, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +80,14 @@ def runs_of(file: str, table: Table) -> dict[str | None, dict[str, np.ndarray]]:
     for name, values in table.items():
         if name in ("episode", "split"):
             rows[name] = np.asarray(values).astype(str)
-            blank = np.flatnonzero(np.isin(rows[name], ("", "nan", "None")))
+            blank = np.flatnonzero(np.isin(rows[name], ("", "nan", "None", "<NA>", "NaT")))
             if len(blank):
                 raise ValueError(f"{file}: column {name!r} is empty in row {blank[0]}; fill it in on every row")
             continue
+        if np.ma.isMaskedArray(values):
+            values = np.ma.filled(values.astype(np.float64), np.nan)
+        if np.iscomplexobj(values):
+            raise ValueError(f"{file}: column {name!r} holds complex numbers; give real ones")
         if np.asarray(values).dtype.kind in "mM":
             raise ValueError(f"{file}: column {name!r} holds dates or durations; give numbers, times in seconds")
         try:
@@ -210,6 +216,16 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
     def say(kind: str, message: str, column: str = "time") -> None:
         findings.append(Finding(kind, f"{episode.name}, {column}", message))
 
+    def tell(slope: float | None, column: str) -> None:
+        if slope is None or checks.SLOPE[0] <= slope <= checks.SLOPE[1]:
+            return
+        kind, cause = "velocity slope", "check units and filters"
+        if slope < 0:
+            kind, cause = "flipped velocity", "its sign is flipped"
+        elif any(checks.SLOPE[0] <= slope / factor <= checks.SLOPE[1] for factor in (DEGREES, 1 / DEGREES)):
+            cause = "one of the two is in degrees; give both in rad"
+        say(kind, f"slope against the position's change is {slope:.2f}, not 1: {cause}; kept as it is", column)
+
     time = episode.time
     spread = checks.jitter(time)
     if spread > checks.JITTER:
@@ -232,6 +248,11 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
                 f"{episode.name}: qpos.{joint} holds no unit quaternion in its last four columns (norms from "
                 f"{np.nanmin(norms):.3g} to {np.nanmax(norms):.3g}); give w, x, y, z in this order"
             )
+        off = float(np.nanmax(np.abs(norms - 1), initial=0.0))
+        if off > ROUNDED:
+            episode.qpos[:, first : first + 4] /= norms[:, None]
+            if off > WORTH_SAYING:
+                say("quaternion norm", f"off 1 by up to {off:.2g}; divided by it", f"qpos.{joint}")
         flips = checks.align_quaternions(episode.qpos[:, first : first + 4])
         if flips:
             say("quaternion sign", f"{flips} change(s) between q and -q, one orientation; aligned", f"qpos.{joint}")
@@ -241,13 +262,22 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
         if other is not None:
             message = f"the numbers fit {other}; kept as they are: give w, x, y, z, and velocities in the body's frame"
             say("other convention", message, f"qpos.{joint}")
+        elif turn:
+            tell(checks.turning_slope(time, oriented, measured), f"qvel.{joint}")
     for i, name in enumerate(columns.qpos):
         # A turn means nothing to the coordinates of a ball or free joint.
         if name != joint_of(name):
             continue
-        episode.qpos[:, i], jumps = checks.unwrap(episode.qpos[:, i])
+        change = None
+        if name in columns.qvel and name not in columns.missing:
+            velocity = episode.qvel[:, columns.qvel.index(name)]
+            change = np.diff(time) * 0.5 * (velocity[1:] + velocity[:-1])
+        episode.qpos[:, i], jumps, fast = checks.unwrap(episode.qpos[:, i], change)
         if jumps:
-            say("wrapped angle", f"{jumps} jump(s) of nearly one turn; unwrapped", f"qpos.{name}")
+            say("wrapped angle", f"{jumps} jump(s) of about one turn; unwrapped", f"qpos.{name}")
+        if fast:
+            message = "many steps are of about half a turn, so whole turns may be lost: sample faster, or give qvel"
+            say("fast angle", message, f"qpos.{name}")
     turning = {joint: episode.qpos[:, first : first + 4] for joint, first in _quaternions(columns)}
     for i, name in enumerate(columns.qvel):
         velocity = episode.qvel[:, i]
@@ -272,16 +302,5 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
                 f"{levels} distinct values in {len(time)} samples, smallest step {step:.4g}",
                 f"qvel.{name}",
             )
-        slope = None if position is None else checks.velocity_slope(time, position, velocity)
-        if slope is None or checks.SLOPE[0] <= slope <= checks.SLOPE[1]:
-            continue
-        kind, cause = "velocity slope", "check units and filters"
-        if slope < 0:
-            kind, cause = "flipped velocity", "its sign is flipped"
-        elif any(checks.SLOPE[0] <= slope / factor <= checks.SLOPE[1] for factor in (DEGREES, 1 / DEGREES)):
-            cause = "one of the two is in degrees; give both in rad"
-        say(
-            kind,
-            f"slope against the position's change is {slope:.2f}, not 1: {cause}; kept as it is",
-            f"qvel.{name}",
-        )
+        if position is not None:
+            tell(checks.velocity_slope(time, position, velocity), f"qvel.{name}")

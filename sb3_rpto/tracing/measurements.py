@@ -111,8 +111,14 @@ class Measurements:
         except ImportError as error:
             message = "reading Parquet needs pandas and pyarrow: pip install 'sb3-rpto[experiments,data]'"
             raise ImportError(message) from error
-        frames = {path: pandas.read_parquet(path) for path in _expand(paths)}
-        return cls.from_tables({p: {name: f[name].to_numpy() for name in f.columns} for p, f in frames.items()})
+        tables = {}
+        for path in _expand(paths):
+            try:
+                frame = pandas.read_parquet(path)
+            except (ValueError, OSError) as error:  # pyarrow's own of broken files are such
+                raise ValueError(f"{path}: no whole Parquet file ({error}); write it again") from error
+            tables[path] = {name: frame[name].to_numpy() for name in frame.columns}
+        return cls.from_tables(tables)
 
     @classmethod
     def from_npz(cls, paths: Paths) -> "Measurements":
@@ -130,6 +136,9 @@ class Measurements:
                     tables[path] = {name: archive[name] for name in archive.files}
             except (zipfile.BadZipFile, EOFError, AttributeError, TypeError) as error:  # the last two: a single array
                 raise ValueError(f"{path}: no whole npz archive of named arrays ({error}); write it again") from error
+            except ValueError as error:
+                message = f"{path}: no npz archive, or it holds arrays of Python objects; write plain numbers and text"
+                raise ValueError(message) from error
         return cls.from_tables(tables)
 
     @classmethod
@@ -144,10 +153,13 @@ class Measurements:
             number, NaN or infinity; time that does not increase, too few rows; a setting or a split that changes within
             an episode, or a split of another name; the message names the place and the remedy
         """
-        if not isinstance(tables, Mapping) or any(isinstance(t, np.ndarray | list) for t in tables.values()):
+        if not isinstance(tables, Mapping) or any(
+            not isinstance(t, Mapping) and not hasattr(t, "columns") for t in tables.values()
+        ):
             raise TypeError("tables must be a dict of tables by their names; write {'run': table} for a single one")
         if not tables:
             raise ValueError("no tables; give at least one")
+        tables = {str(name): table for name, table in tables.items()}
         stems = [Path(name).stem for name in tables]
         findings: list[Finding] = []
         episodes: list[Episode] = []

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.signal import butter, filtfilt
 
 from sb3_rpto.effects import Effect, Scales, Simulation
-from sb3_rpto.effects.simulation import Switch, filter_commands, names_of, prepare, settled
+from sb3_rpto.effects.simulation import Switch, collect, filter_commands, names_of, prepare, pushing, settled
 from sb3_rpto.effects.world import BatchWorld, LiveWorld
 from sb3_rpto.tracing.checks import MIN_ROWS
 from sb3_rpto.tracing.episodes import Episode
@@ -107,7 +107,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     switch = Switch(LiveWorld(model, mj), None if enabled.all() else enabled)
     needed, load = np.zeros_like(qvel), np.zeros_like(qvel)
     extra = np.zeros_like(qvel)
-    acting = [(effect, x) for effect, x in active if effect.overrides("act")]
+    acting = pushing(active)
     for t in range(len(time)):
         switch(t)
         mj.qpos[:], mj.qvel[:], mj.ctrl[:] = qpos[t], qvel[t], around[t]
@@ -123,11 +123,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
         if acting:
             world.qpos[:], world.qvel[:] = qpos[t], qvel[t]
             world.ctrl[:] = around[t]
-            world.batch.forward()
-            world.force[:] = 0
-            world.friction[:] = 0
-            for effect, x in acting:
-                effect.act(world, x)
+            collect(world, acting)
             extra[t] = world.force[0]
             level = level + world.friction[0]
         extra[t] -= level * np.sign(qvel[t])
@@ -186,7 +182,7 @@ class Typical:
             at = {n: float(getattr(self, n)[effect.dof]) for n in ("torque", "velocity", "inertia", "span")}
             return replace(rest, **at)
         if effect.place == "actuator":
-            return replace(rest, command=float(self.command[effect.index]))
+            return replace(rest, command=float(self.command[effect.ctrl]))
         if effect.place == "body":
             return replace(rest, mass=float(self.mass[effect.index]))
         return rest

@@ -1,6 +1,7 @@
 """Corrected simulators reload bit for bit, and models load from whatever holds one."""
 
 import json
+import pickle
 
 import gymnasium as gym
 import mujoco
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 
 from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales, Simulation, declare, mjcf, register
+from sb3_rpto.effects.bodies import LinkLength
 from sb3_rpto.effects.carry import carried_by, correct, load_corrected, save_corrected
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
 from sb3_rpto.effects.model import load_model, numbers
 from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.corrected import apply_effects
 
 POLE = "InvertedDoublePendulum-v5"
 ARM = """
@@ -239,6 +242,25 @@ def test_an_environment_reloads_with_what_was_changed_in_it(tmp_path, name):
     assert_equal_models(load_corrected(tmp_path).model, correct(model, []))
 
 
+def test_a_walker_that_is_loaded_stands_as_the_one_that_was_saved(tmp_path):
+    chosen = [LinkLength("leg", change=0.4)]
+    one = apply_effects(gym.make("Hopper-v5"), chosen)
+    save_corrected(tmp_path, gym.make("Hopper-v5"), chosen)
+    corrected = load_corrected(tmp_path)
+    of_the_file = gym.make("Hopper-v5", xml_file=str(tmp_path / "model.xml"))  # its numbers are there, its pose is not
+    for env in (corrected.apply(gym.make("Hopper-v5")), corrected.apply(of_the_file)):
+        again = pickle.loads(pickle.dumps(env))
+        start = one.reset(seed=0)[0]
+        for twin in (env, again):
+            np.testing.assert_allclose(twin.reset(seed=0)[0], start, atol=1e-12)
+            assert twin.unwrapped.data.ncon == 0
+            np.testing.assert_allclose(twin.unwrapped._healthy_z_range, one.unwrapped._healthy_z_range)
+        for _ in range(20):
+            action = one.action_space.sample()
+            for mine, theirs in zip(one.step(action)[:3], env.step(action)[:3]):
+                np.testing.assert_allclose(mine, theirs, atol=1e-4)  # the file has six digits
+
+
 def test_the_applied_one_steps_as_the_saved_one(tmp_path):
     env, twin = gym.make(POLE), gym.make(POLE)
     chosen = [
@@ -341,6 +363,19 @@ def test_torn_folders_are_refused(tmp_path):
     path.write_text(json.dumps(stored | {"format": 99}))
     with pytest.raises(ValueError, match="format 99"):
         load_corrected(tmp_path)
+    effect = stored["effects"][0]
+    for damaged in (
+        {key: value for key, value in stored.items() if key != "exact"},
+        {key: value for key, value in stored.items() if key != "effects"},
+        {key: value for key, value in stored.items() if key != "mujoco"},
+        stored | {"effects": [{key: value for key, value in effect.items() if key != "values"}]},
+        stored | {"effects": [{key: value for key, value in effect.items() if key != "kind"}]},
+        stored | {"heights": [1.0]},
+        [stored],
+    ):
+        path.write_text(json.dumps(damaged))
+        with pytest.raises(ValueError, match="does not describe a corrected simulator"):
+            load_corrected(tmp_path)
     path.write_text(json.dumps(stored)[:100])
     with pytest.raises(ValueError, match="does not describe a corrected simulator"):
         load_corrected(tmp_path)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -313,6 +314,26 @@ def test_unwrap_restores_any_smooth_angle(seed):
     np.testing.assert_allclose(unwrap(np.angle(np.exp(1j * true)))[0], true, atol=1e-10)
 
 
+@pytest.mark.parametrize("rate", [-240.0, -90.0, 120.0, 200.0, 290.0, 700.0])
+def test_a_wheel_that_turns_fast_is_unwrapped_by_its_velocity(rate):
+    """More than a quarter turn from one sample to the next."""
+    time = np.arange(200) * 0.01
+    true, velocity = rate * time + 5 * np.sin(20 * time), rate + 100 * np.cos(20 * time)
+    table = {"time": time, "qpos.wheel": np.angle(np.exp(1j * true)), "qvel.wheel": velocity}
+    data = Measurements.from_tables({"a": table})
+    assert kinds(data) == ["wrapped angle"]
+    np.testing.assert_allclose(data.episodes[0].qpos[:, 0], true, atol=1e-9)
+    lost = Measurements.from_tables({"a": {**table, "qvel.wheel": np.zeros(200) + rate % 70}})  # which does not fit
+    assert ("fast angle" in kinds(lost)) == (60 < abs(rate) % 628 < 560)
+
+
+def test_a_wheel_whose_turns_cannot_be_told_is_said():
+    time = np.arange(200) * 0.01
+    data = Measurements.from_tables({"a": {"time": time, "qpos.wheel": np.angle(np.exp(1j * 250 * time))}})
+    assert "fast angle" in kinds(data)
+    assert "missing velocity" in kinds(data)
+
+
 def test_a_continuous_angle_is_left_alone():
     angle = np.linspace(-20, 20, 100)
     assert unwrap(angle)[0] is angle
@@ -384,6 +405,64 @@ def test_another_convention_of_rotations_is_told(kind, last, world, said):
     told = [finding.message for finding in data.findings if finding.kind == "other convention"]
     assert len(told) == (said is not None)
     assert said is None or f"the numbers fit {said};" in told[0]
+
+
+@pytest.mark.parametrize("kind", ["free", "ball"])
+@pytest.mark.parametrize(
+    ("factor", "found"), [(1.0, None), (-1.0, "flipped velocity"), (180 / np.pi, "velocity slope")]
+)
+def test_an_angular_velocity_against_the_quaternions_is_reported(kind, factor, found):
+    columns, time, values = tumble(kind)
+    values[:, -3:] *= factor
+    names = [*(f"qpos.{name}" for name in columns.qpos), *(f"qvel.{name}" for name in columns.qvel)]
+    data = Measurements.from_tables({"a": {"time": time, **dict(zip(names, values.T))}})
+    assert [f.kind for f in data.findings if "convention" not in f.kind] == ([found] if found else [])
+    assert found is None or ("in degrees" in data.findings[0].message) == (factor > 1)
+
+
+def test_quaternions_are_given_norm_one():
+    columns, time, values = tumble("ball")
+    names = [f"qpos.{name}" for name in columns.qpos]
+    exact, scaled = (
+        Measurements.from_tables({"a": {"time": time, **dict(zip(names, size * values[:, :4].T))}})
+        for size in (1.0, 1.04)
+    )
+    assert kinds(scaled) == ["quaternion norm", *kinds(exact)]
+    np.testing.assert_allclose(scaled.episodes[0].qpos, exact.episodes[0].qpos, atol=1e-12)
+    np.testing.assert_allclose(scaled.episodes[0].qvel, exact.episodes[0].qvel, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"episode": pd.array(["a", None] * 100, dtype="string")}, "column 'episode' is empty in row 1"),
+        ({"ctrl.motor": np.ones(200) + 1j}, "holds complex numbers"),
+        ({"ctrl.motor": np.ma.masked_greater(np.linspace(0, 1, 200), 0.9)}, "NaN or infinite"),
+        ({"qpos": np.zeros(200)}, "write a column of shape .*'qpos.<name>'"),
+    ],
+)
+def test_tables_of_other_kinds_are_refused_by_name(change, said):
+    with pytest.raises(ValueError, match=f"run.*{said}"):
+        Measurements.from_tables({"run": {**swing(), **change}})
+
+
+def test_tables_may_be_named_by_numbers_and_are_not_columns():
+    frame = pd.DataFrame(swing())
+    assert [e.name for e in Measurements.from_tables({0: frame, 1: swing(phase=1.0)}).episodes] == ["0", "1"]
+    for table in (swing(), dict(frame.items())):
+        with pytest.raises(TypeError, match=r"write \{'run': table\}"):
+            Measurements.from_tables(table)
+
+
+def test_files_that_are_broken_are_named(tmp_path):
+    np.savez(tmp_path / "objects.npz", time=np.array([{}], dtype=object))
+    (tmp_path / "text.npz").write_text("time,qpos.hinge")
+    (tmp_path / "text.parquet").write_text("time,qpos.hinge")
+    for name in ("objects", "text"):
+        with pytest.raises(ValueError, match=rf"{name}\.npz: "):
+            Measurements.from_npz(tmp_path / f"{name}.npz")
+    with pytest.raises(ValueError, match=r"text\.parquet: no whole Parquet file"):
+        Measurements.from_parquet(tmp_path / "text.parquet")
 
 
 def test_velocity_estimate_is_exact_for_constant_speed_on_a_jittered_clock():

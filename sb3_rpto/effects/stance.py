@@ -24,11 +24,14 @@ class Stance:
     are left alone.
 
     :param base: an unwrapped gymnasium MuJoCo environment, as it stands before
+    :param before: :func:`nominal_heights` of the model before, where that of ``base`` has changed already
     """
 
-    def __init__(self, base: Any) -> None:
+    def __init__(self, base: Any, before: tuple[float, float] | None = None) -> None:
         self._joint = _vertical(base.model) if hasattr(base, "init_qpos") else None
         found = None if self._joint is None else _heights(base.model, self._joint, base.init_qpos)
+        if found is not None and before is not None:
+            found = before
         if found is None:
             self._joint = None
             return
@@ -58,11 +61,13 @@ class StandingEnv(CorrectedEnv):
 
     :param env: as there
     :param effects: as there
+    :param before: as of :class:`Stance`
     :raises ValueError: as there
     """
 
-    def __init__(self, env: gym.Env, effects: Sequence[Effect]) -> None:
-        self._stance = Stance(env.unwrapped)
+    def __init__(self, env: gym.Env, effects: Sequence[Effect], before: tuple[float, float] | None = None) -> None:
+        self._before = before
+        self._stance = Stance(env.unwrapped, before)
         super().__init__(env, effects)
 
     def set_effects(self, effects: Sequence[Effect]) -> None:
@@ -70,8 +75,18 @@ class StandingEnv(CorrectedEnv):
         super().set_effects(effects)
         self._stance.take(self.unwrapped)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """As in :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`."""
+        return {**super().__getstate__(), "before": self._before}
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         StandingEnv.__init__(self, **state)
+
+
+def nominal_heights(model: mujoco.MjModel) -> tuple[float, float] | None:
+    """Of the reference pose, as :class:`Stance` keeps them: its lowest point over the floor, its body over that; m."""
+    joint = _vertical(model)
+    return None if joint is None else _heights(model, joint, model.qpos0)
 
 
 def _vertical(model: mujoco.MjModel) -> int | None:
