@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 BAD_INPUT, INTERRUPTED = 2, 130
 #: What users can cause is said in one line; an error of ours keeps its traceback, unless it is of these kinds, too,
 #: and nobody asked for it.
-USER_ERRORS = (ValueError, TypeError, OSError, ImportError)
+USER_ERRORS = (ValueError, TypeError, OSError, ImportError, NotImplementedError)
 #: Readers of recordings by the suffix of their files.
 FORMATS = {"csv": "from_csv", "parquet": "from_parquet", "npz": "from_npz"}
 #: Modules with ``main(arguments) -> exit code`` behind ``sb3-rpto benchmark NAME``.
@@ -65,8 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("sb3-rpto: interrupted", file=sys.stderr)
         return INTERRUPTED
-    except USER_ERRORS as error:
-        if traceback:
+    except Exception as error:
+        # gymnasium's own errors have no kind in common with Python's, and its import takes its time.
+        if traceback or not (isinstance(error, USER_ERRORS) or type(error).__module__ == "gymnasium.error"):
             raise
         print(f"sb3-rpto: error: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
         return BAD_INPUT

@@ -6,7 +6,7 @@ import inspect
 import math
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from numbers import Integral
+from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
 from gymnasium import spaces
@@ -174,20 +174,48 @@ def check_values(
         raise ValueError(f"real_ratio must lie in [0, 1), got {real_ratio}")
     if not 0 <= weight_floor < math.inf:
         raise ValueError(f"weight_floor must be a finite number and not negative, got {weight_floor}")
-    if not 0 < tau <= 1:
+    check_sac_values(
+        tau=tau,
+        gamma=gamma,
+        gradient_steps=gradient_steps,
+        target_update_interval=target_update_interval,
+        batch_size=batch_size,
+        buffer_size=buffer_size,
+        train_freq=train_freq,
+    )
+    _check_counts(source_steps=source_steps, model_train_freq=model_train_freq)
+
+
+def check_sac_values(
+    *,
+    tau: Any,
+    gamma: Any,
+    gradient_steps: Any,
+    target_update_interval: Any,
+    batch_size: Any,
+    buffer_size: Any,
+    train_freq: Any,
+) -> None:
+    """Refuse numbers out of range of the arguments that SAC has.
+
+    :raises ValueError: naming the argument, its value and what it may be
+    """
+    if not (_is_number(tau) and 0 < tau <= 1):
         raise ValueError(f"tau must lie in (0, 1], got {tau!r}")
-    if not 0 <= gamma <= 1:
+    if not (_is_number(gamma) and 0 <= gamma <= 1):
         raise ValueError(f"gamma must lie in [0, 1], got {gamma!r}")
     if not _is_integer(gradient_steps):
         raise ValueError(f"gradient_steps must be an integer (negative: one a target step), got {gradient_steps!r}")
-    for name, value in {
-        "source_steps": source_steps,
-        "model_train_freq": model_train_freq,
-        "target_update_interval": target_update_interval,
-        "batch_size": batch_size,
-        "buffer_size": buffer_size,
-        "train_freq": train_freq[0] if isinstance(train_freq, tuple) else train_freq,  # or (number, unit)
-    }.items():
+    _check_counts(
+        target_update_interval=target_update_interval,
+        batch_size=batch_size,
+        buffer_size=buffer_size,
+        train_freq=train_freq[0] if isinstance(train_freq, tuple) else train_freq,  # or (number, unit)
+    )
+
+
+def _check_counts(**values: Any) -> None:
+    for name, value in values.items():
         if not _is_integer(value) or value < 1:
             raise ValueError(f"{name} must be a positive integer, got {value!r}")
 
@@ -353,6 +381,10 @@ def _callbacks(callback: BaseCallback) -> Iterator[BaseCallback]:
     for part in parts:
         if isinstance(part, BaseCallback):
             yield from _callbacks(part)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def _is_integer(value: Any) -> bool:

@@ -21,7 +21,7 @@ from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_rpto.algorithms.machine import check_machine, check_simulator, doubts
+from sb3_rpto.algorithms.machine import check_machine, check_simulator, doubt, doubt_rules
 from sb3_rpto.algorithms.snapshots import PolicySnapshots
 from sb3_rpto.algorithms.source import SourceWorld
 from sb3_rpto.algorithms.worlds import (
@@ -104,6 +104,8 @@ class TwoWorlds(PolicySnapshots):
     _owed: int = 0
     #: whether the simulator was judged after its first fit to this target
     _judged_target: bool = False
+    #: whether a rule of the source was seen not to be this target's
+    _judged_rules: bool = False
     #: the run's callbacks while it lasts: they know the step that SB3 has taken and not yet stored
     _callback: BaseCallback | None
     #: where a loaded checkpoint left the worlds, until ``learn()`` puts them back
@@ -151,7 +153,7 @@ class TwoWorlds(PolicySnapshots):
         self._bind_rules(venv, of_target=True)
         self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
         self._offline = self._traces_log = False
-        self._judged_target = False
+        self._judged_target = self._judged_rules = False
         self._last_obs = None
         if self.seed is not None:
             self.target_env.seed(self.seed + TARGET_SEED_OFFSET)
@@ -165,16 +167,11 @@ class TwoWorlds(PolicySnapshots):
     def _doubt_the_target(self, error: float) -> None:
         """Warn, after the first fit (with the loop closed: after the first trace), where the simulator does not fit."""
         assert self.dynamics is not None
+        self._judged_rules = self._judged_rules or doubt_rules(self.dynamics, self.transitions("target"))
         if self._judged_target or (self.loop is not None and not self.loop.found):
             return
         self._judged_target = True
-        found = doubts(self.dynamics, 0.0 if self._keeps_phi() else error)  # which is mostly noise there
-        if found:
-            warnings.warn(
-                f"after the fit {' and '.join(found)}: do the target's observations hold the model's joints in its "
-                "order and units? If so, wider bounds, further declared numbers or close_loop=True may account for it",
-                stacklevel=2,
-            )
+        doubt(self.dynamics, 0.0 if self._keeps_phi() else error)  # which is mostly noise there
 
     def _adopt_target_rules(self) -> None:
         """Hopper's healthy heights follow its body, say: phi_0 knew the source's rules, phi shall know the target's.

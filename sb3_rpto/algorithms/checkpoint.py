@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_rpto.algorithms.arguments import check_values_of, constructor_names
 from sb3_rpto.algorithms.bookkeeping import STEP, RuleOfEnvironment, TwoWorlds
 from sb3_rpto.algorithms.machine import check_simulator
+from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
 from sb3_rpto.algorithms.worlds import find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.effects.names import near
@@ -67,6 +68,8 @@ class Resumable(TwoWorlds):
         loaded = self._resume_state  # a loaded model that has not learned since stands where it was saved first
         learner = self.snapshots.get("learner")
         self._resume_state = {**loaded, "warm": self._warm, "learner": learner} if loaded else capture(self)
+        if self.env is not None:
+            self._resume_state["normalised"] = normalises(self.get_vec_normalize_env())
         config, self.dynamics_config = self.dynamics_config, _picklable(self.dynamics_config)
         try:
             write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
@@ -139,6 +142,9 @@ class Resumable(TwoWorlds):
         if model.env is not None:
             check_simulator(model.env, model.dynamics)
             model._bind_rules(model.env, of_target=False)
+            had = model._resume_state.get("normalised")
+            if had is not None:
+                check_normalisation(had, model.get_vec_normalize_env(), "the model")
         if target_env is not None:
             model.set_target_env(target_env)
         return model

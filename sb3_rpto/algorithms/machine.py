@@ -9,7 +9,7 @@ from itertools import zip_longest
 import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_rpto.dynamics.base import Dynamics
+from sb3_rpto.dynamics.base import Dynamics, Transitions
 from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
@@ -20,6 +20,9 @@ from sb3_rpto.tracing.columns import columns_of
 #: A fitted simulator should err by less than this share of a standard one-step change. Shifted tasks end below 0.15
 #: (tests and benchmarks; observation noise of a hundredth included), joints in another order above 0.53.
 LARGE = 0.5
+#: A known reward is another one where it errs by so much of the rewards' deviation, a float's rounding apart; more than
+#: so many transitions, and so many of all, must say so.
+FAR, ROUNDING, FEW, FEW_OF_ALL = 0.1, 1e-3, 2, 0.01
 
 
 def check_machine(source: VecEnv, target: VecEnv) -> None:
@@ -78,16 +81,49 @@ def _dt(env: gym.Env) -> float:
     return float(env.unwrapped.dt)  # type: ignore[attr-defined]
 
 
-def doubts(dynamics: Dynamics, error: float) -> list[str]:
-    """What speaks against a simulator that was just fitted; empty where nothing does.
+def doubt(dynamics: Dynamics, error: float) -> None:
+    """Warn of what speaks against a simulator that was just fitted.
 
     :param dynamics: after a fit; only MuJoCo simulators are judged
     :param error: its one-step error on D_target
     """
     if not isinstance(dynamics, PhysicalDynamics | ResidualDynamics):
-        return []
+        return
     physical = dynamics.physical if isinstance(dynamics, ResidualDynamics) else dynamics
     found = [f"{name} lies at its bound" for name in physical.declared_at_bounds()]
     if error > LARGE:
         found.append(f"the one-step error is still {error:.2g} of a typical step's change")
-    return found
+    if found:
+        warnings.warn(
+            f"after the fit {' and '.join(found)}: do the target's observations hold the model's joints in its "
+            "order and units? If so, wider bounds, further declared numbers or close_loop=True may account for it",
+            stacklevel=3,
+        )
+
+
+def doubt_rules(dynamics: Dynamics, data: Transitions) -> bool:
+    """Warn of a known rule that is not the target's, and say whether there is one.
+
+    Few transitions that differ may be those at a threshold, where observations are rounded.
+
+    :param dynamics: with ``reward_fn`` and ``termination_fn``, where they are known
+    :param data: D_target
+    """
+    given, said = (data.observations, data.actions, data.next_observations), []
+    for name, recorded in (("reward_fn", data.rewards), ("termination_fn", data.terminations)):
+        rule = getattr(dynamics, name, None)
+        if rule is None or not len(data):
+            continue
+        far = 0.5 if name == "termination_fn" else FAR * float(recorded.std(correction=0)) + ROUNDING
+        answers = rule(*given).reshape(len(data)).to(recorded)
+        wrong = int(((answers - recorded).abs() > far + ROUNDING * recorded.abs()).sum())
+        if wrong > max(FEW, FEW_OF_ALL * len(data)):
+            said.append(f"{name} is not that of {wrong} of {len(data)} target transitions")
+    if said:
+        name = said[0].partition(" ")[0]
+        warnings.warn(
+            f"what is known of the source's task does not hold in the target: {' and '.join(said)}; pass the target's "
+            f"rule by dynamics_kwargs={{'{name}': ...}}, or None to have it learned",
+            stacklevel=3,
+        )
+    return bool(said)

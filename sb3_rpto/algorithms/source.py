@@ -23,7 +23,7 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
 from sb3_rpto.effects.stance import StandingEnv
-from sb3_rpto.envs.state import copy_env, restore_state, save_state
+from sb3_rpto.envs.state import copy_env, restore_state, save_state, whereabouts
 
 RolloutStart = Literal["target", "source", "mix"]
 
@@ -91,6 +91,7 @@ class EpisodeSource(SourceWorld):
         self.returns: deque[float] = deque(maxlen=100)
         self.lengths: deque[int] = deque(maxlen=100)
         self._last_obs = first_obs
+        self._left_at: list[tuple[Any, ...]] | None = whereabouts(env)
         self._last_raw: np.ndarray | None = None if first_obs is None else self._raw(first_obs)
 
     def interact(self, model: RelativeUpdate, n_steps: int, random: bool = False) -> int:
@@ -102,6 +103,8 @@ class EpisodeSource(SourceWorld):
         :return: the number of transitions stored
         """
         normaliser = self._normaliser
+        if self._left_at not in (None, whereabouts(self.env)):  # somebody stepped or reset it: its episodes are lost
+            self.begin_anew()
         if self._last_obs is None:
             self._last_obs = np.asarray(self.env.reset())
             self._last_raw = self._raw(self._last_obs)
@@ -136,6 +139,7 @@ class EpisodeSource(SourceWorld):
                     self.lengths.append(info["episode"]["l"])
             self._last_obs = np.asarray(new_obs)
             steps += self.env.num_envs
+        self._left_at = whereabouts(self.env)
         return steps
 
     def _episode_ended(self, index: int) -> None:
@@ -167,6 +171,7 @@ class EpisodeSource(SourceWorld):
             self.env.unwrapped.set_state(state["model"])  # type: ignore[attr-defined]
         for name in self._STATE:
             setattr(self, name, state[name])
+        self._left_at = None  # the source itself is put back elsewhere
 
 
 class SimulatorSource(EpisodeSource):

@@ -101,7 +101,7 @@ def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: options.Wo
     video.require(parsed.video)
     if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         os.environ.setdefault("MUJOCO_GL", "egl")  # of what draws without a display, what works
-    agent = parsed.source_model or known.get("source_model")
+    agent = parsed.source_model or _agent_of(parsed.model, known)
     if agent is None:
         raise ValueError("--video compares with the source policy: pass its zip by --source-model")
     name = parsed.source or known.get("source") or source_of(target.env_id)
@@ -112,6 +112,20 @@ def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: options.Wo
     policy = load_policy(agent, "--source-model")
     _check_spaces(policy, source, "--source-model", "--source")
     return policy, source
+
+
+def _agent_of(folder: Path, known: dict[str, Any]) -> str | None:
+    """The source agent of a run, whose path is kept relative to its folder.
+
+    :raises FileNotFoundError: it is there no longer
+    """
+    agent = known.get("source_model")
+    if agent is None:
+        return None
+    found = [path for path in (folder / agent, Path(agent)) if path.is_file()]
+    if not found:
+        raise FileNotFoundError(f"the run's source agent {agent!r} is not there; pass its zip by --source-model")
+    return str(found[0])
 
 
 def _check_spaces(policy: Policy, world: options.World, argument: str, of: str) -> None:
@@ -129,9 +143,9 @@ def _check_spaces(policy: Policy, world: options.World, argument: str, of: str) 
 
 def _episode(env: Any, policy: Policy, seed: int | None, deterministic: bool) -> float:
     observation, _ = env.reset(seed=seed)
-    total, over = 0.0, False
+    total, over, state = 0.0, False, None
     while not over:
-        action, _ = policy.predict(observation, deterministic=deterministic)
+        action, state = policy.predict(observation, state, deterministic=deterministic)
         observation, reward, terminated, truncated, _ = env.step(action)
         total += float(reward)
         over = terminated or truncated

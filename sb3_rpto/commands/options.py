@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import difflib
 import importlib
+import inspect
 import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
@@ -69,7 +70,8 @@ def setting(text: str) -> tuple[str, Any]:
         parsed = yaml.safe_load(value)
     except yaml.YAMLError as error:
         raise argparse.ArgumentTypeError(f"{text!r}: the value is no YAML") from error
-    return name, _read(parsed)
+    value = _read(parsed)
+    return name, tuple(value) if name == "train_freq" and isinstance(value, list) else value
 
 
 def _read(parsed: Any) -> Any:
@@ -117,6 +119,25 @@ def check_names(given: Iterable[str], known: Collection[str]) -> None:
     for name in given:
         if name not in known:
             raise ValueError(f"--set {name}: there is no such argument{_perhaps(name, known)}")
+
+
+def check_sac(settings: dict[str, Any]) -> None:
+    """Refuse values that SAC would take and fail on later; what is not given is its own.
+
+    :raises ValueError: naming the argument
+    """
+    from stable_baselines3 import SAC
+
+    from sb3_rpto.algorithms.arguments import check_sac_values
+
+    own = {name: p.default for name, p in inspect.signature(SAC).parameters.items()} | settings
+    check_sac_values(**{name: own[name] for name in inspect.signature(check_sac_values).parameters})
+    rate = own["learning_rate"]
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not rate > 0:
+        raise ValueError(f"--set learning_rate is {rate!r}; give a number above 0 (schedules: the Python interface)")
+    for name in ("action_noise", "replay_buffer_class", "replay_buffer_kwargs"):
+        if own[name] is not None:
+            raise ValueError(f"--set {name}: it takes an object of Python; use the Python interface")
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,18 +68,38 @@ def read_rows(paths: Sequence[Path]) -> list[dict[str, Any]]:
     :raises ValueError: for a file that is no result, and for folders without any
     """
     rows: list[dict[str, Any]] = []
+    seen: set[Path] = set()
     for path in paths:
         if not path.exists():
             raise FileNotFoundError(f"RESULT: there is nothing at {str(path)!r}; check the path")
         files = sorted(path.rglob("*.json")) if path.is_dir() else [path]
-        for file in files:
+        for file in (f for f in files if f.resolve() not in seen):
+            seen.add(file.resolve())
+            if path.is_dir() and file.name == "config.json" and not file.with_name("result.json").exists():
+                print(f"sb3-rpto: left out, not finished: {file.parent}", file=sys.stderr)
             found = _result(file)
             if found is None and not path.is_dir():
                 raise ValueError(f"RESULT {file} is no result file of sb3-rpto")
             rows += found or []
     if not rows:
         raise ValueError(f"RESULT: there are no result files in {', '.join(map(str, paths))}")
-    return rows
+    return _labelled(rows)
+
+
+def _labelled(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows with what settings of one method at one target differ in added to its name: they are other methods."""
+    places: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        known = places.setdefault((row["target"], row["method"]), [])
+        if row["settings"] not in known:
+            known.append(row["settings"])
+    found = []
+    for row in rows:
+        own, others = row["settings"], places[row["target"], row["method"]]
+        names = sorted({name for other in others for name in {*own, *other} if own.get(name) != other.get(name)})
+        label = " ".join([row["method"], *(f"{name}={own.get(name, 'default')}" for name in names)])
+        found.append({**row, "method": label})
+    return found
 
 
 def _result(file: Path) -> list[dict[str, Any]] | None:
@@ -91,6 +112,7 @@ def _result(file: Path) -> list[dict[str, Any]] | None:
             of_run["seed"] = content["job"]["seed"]
         else:
             of_run = {name: content["config"][name] for name in ("method", "target", "seed")}
+        of_run["settings"] = content.get("config", {}).get("settings", {})
         return [{**of_run, "steps": row["steps"], "return": row["return"]} for row in content["rows"]]
     except (ValueError, KeyError, TypeError):
         return None

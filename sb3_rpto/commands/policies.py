@@ -25,8 +25,8 @@ class Policy(Protocol):
         """What it does."""
         ...
 
-    def predict(self, observation: Any, *, deterministic: bool = False) -> tuple[np.ndarray, Any]:
-        """The action for an observation."""
+    def predict(self, observation: Any, state: Any = None, *, deterministic: bool = False) -> tuple[np.ndarray, Any]:
+        """The action for an observation, and the state of a recurrent policy after it."""
         ...
 
 
@@ -46,9 +46,10 @@ def load_policy(path: str | Path, argument: str) -> Policy:
         raise ValueError(f"{argument} {str(path)!r} is no zip of a model of Stable-Baselines3")
     if "trpo.policy" in parameters:  # SLBO acts by TRPO's policy, beside which it keeps SAC's
         return SLBO.load(path, device="cpu")
-    policy = data["policy_class"](
-        data["observation_space"], data["action_space"], lambda _: 0.0, **data.get("policy_kwargs", {})
-    )
+    kwargs = dict(data.get("policy_kwargs", {}))
+    if data.get("use_sde"):  # PPO and A2C hand it over beside the others
+        kwargs["use_sde"] = True
+    policy = data["policy_class"](data["observation_space"], data["action_space"], lambda _: 0.0, **kwargs)
     policy.load_state_dict(parameters["policy"])
     policy.set_training_mode(False)
     return policy

@@ -57,15 +57,19 @@ class RunFolder:
         run, asked = cls(path), json.loads(json.dumps(config))
         path.mkdir(parents=True, exist_ok=True)
         file = path / "config.json"
-        if not run.result.exists() and run.newest_checkpoint() is None:  # there is nothing to keep
+        if not run.result.exists() and run.newest_checkpoint() is None:
+            for kept in () if file.exists() else (run.model, run.replay_buffer):
+                if kept.exists():
+                    raise ValueError(f"--out {path} holds a {kept.name} that no run of ours wrote; give another folder")
             run._write_json(file, asked)
             return run
-        kept = json.loads(file.read_text(encoding="utf-8"))
-        changed = sorted(name for name in {*kept, *asked} if kept.get(name) != asked.get(name))
+        begun = json.loads(file.read_text(encoding="utf-8"))
+        names = {*begun, *asked}
+        changed = sorted(n for n in names if begun.get(n) != asked.get(n) and not _same_file(path, begun, asked, n))
         if changed:
             name = changed[0]
             raise ValueError(
-                f"--out {path} holds a run with {name}={kept.get(name)!r}, not {asked.get(name)!r}; choose another "
+                f"--out {path} holds a run with {name}={begun.get(name)!r}, not {asked.get(name)!r}; choose another "
                 "folder, or repeat the command that began it to go on"
             )
         return run
@@ -88,6 +92,7 @@ class RunFolder:
         """
         folder = self.path / "checkpoints"
         unfinished = folder / f".{steps:010d}.{os.getpid()}"
+        shutil.rmtree(unfinished, ignore_errors=True)  # of a killed run: in a container all have the same number
         unfinished.mkdir(parents=True)
         write(unfinished)
         unfinished.rename(folder / f"{steps:010d}")
@@ -104,6 +109,19 @@ class RunFolder:
     def _write_json(path: Path, content: Any) -> None:
         text = json.dumps(content, indent=1)
         write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"), suffix="json")
+
+
+def beside(folder: Path, file: str | None) -> str | None:
+    """The path of a file from a run's folder, which holds wherever the command is given."""
+    return None if file is None else os.path.relpath(Path(file).resolve(), folder.resolve())
+
+
+def _same_file(folder: Path, begun: dict[str, Any], asked: dict[str, Any], name: str) -> bool:
+    """Whether a run was begun with the same file by a path from where its command was given."""
+    before, now = begun.get(name), asked.get(name)
+    if name not in ("source_model", "source_data") or before is None or now is None:
+        return False
+    return Path(before).resolve() == (folder / now).resolve()
 
 
 class SavedCurve(LearningCurve):

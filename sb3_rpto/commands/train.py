@@ -45,6 +45,7 @@ def run(parsed: argparse.Namespace) -> int:
 
     from sb3_rpto.algorithms.arguments import constructor_names
     from sb3_rpto.algorithms.checkpoint import write_atomically
+    from sb3_rpto.algorithms.worlds import check_spaces
     from sb3_rpto.commands.runs import RunFolder, SavedCurve, load_checkpoint
     from sb3_rpto.zoo.settings import shipped_settings
 
@@ -53,7 +54,16 @@ def run(parsed: argparse.Namespace) -> int:
     settings = {**shipped_settings("sac", task.env_id), **dict(parsed.set)}
     steps = int(settings.pop("n_timesteps") if parsed.steps is None else parsed.steps)
     settings.pop("n_timesteps", None)
-    options.check_names(settings, constructor_names(SAC))
+    options.check_names(settings, constructor_names(SAC) - {"env", "seed", "device"})
+    options.check_sac(settings)
+    first = settings.get("learning_starts", 100)
+    if first >= steps:
+        raise ValueError(
+            f"--steps {steps} ends before the first update (learning_starts={first}): nothing would be learned; give "
+            "more steps, or --set learning_starts=100"
+        )
+    env = task.make()
+    check_spaces(env.observation_space, env.action_space)
     settings.setdefault("buffer_size", min(1_000_000, steps))  # SAC's, but no larger a file than there is to keep
     every = parsed.every or max(steps // 10, 1)
     config = {
@@ -76,9 +86,9 @@ def run(parsed: argparse.Namespace) -> int:
     checkpoint = folder.newest_checkpoint()
     model: Any
     if checkpoint is None:
-        model = SAC(env=task.make(), seed=parsed.seed, device=parsed.device, **settings)
+        model = SAC(env=env, seed=parsed.seed, device=parsed.device, **settings)
     else:
-        model = load_checkpoint(checkpoint, task.make(), device=parsed.device)
+        model = load_checkpoint(checkpoint, env, device=parsed.device)
         curve.restore(checkpoint)
     model.learn(steps - model.num_timesteps, callback=curve, reset_num_timesteps=checkpoint is None)
     curve.env.close()

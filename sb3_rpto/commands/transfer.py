@@ -66,7 +66,7 @@ def add(commands: Any) -> None:
 def run(parsed: argparse.Namespace) -> int:
     """Transfer, or go on with it."""
     from sb3_rpto.algorithms.checkpoint import write_atomically
-    from sb3_rpto.commands.runs import RunFolder, SavedCurve
+    from sb3_rpto.commands.runs import RunFolder, SavedCurve, beside
     from sb3_rpto.experiments.methods import REGISTRY, Run
     from sb3_rpto.zoo.settings import ALGORITHMS, shipped_settings
 
@@ -92,8 +92,8 @@ def run(parsed: argparse.Namespace) -> int:
         "steps": steps,
         "seed": parsed.seed,
         "settings": settings,
-        "source_model": parsed.source_model,
-        "source_data": parsed.source_data,
+        "source_model": beside(parsed.out, parsed.source_model),
+        "source_data": beside(parsed.out, parsed.source_data),
         "every": every,
         "episodes": parsed.episodes,
     }

@@ -211,7 +211,8 @@ def _task_name(view: _View) -> str | None:
 
 def _changes_task(heir: type, task: type) -> bool:
     """Whether a class has a method of its own in the place of one that a known task's rules are about."""
-    return any(callable(method) and name in vars(heir) for name, method in vars(task).items() if name not in _NOT_RULES)
+    methods = {name for name, value in vars(task).items() if callable(value) or isinstance(value, property)}
+    return bool((methods - _NOT_RULES) & vars(heir).keys())
 
 
 # --- terminations -----------------------------------------------------------------------------------------------

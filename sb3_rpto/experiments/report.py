@@ -85,7 +85,7 @@ def _percentiles(draws: np.ndarray, confidence: float) -> tuple[float, float]:
 def summarise(rows: pd.DataFrame, by: list[str], value: str = "return") -> pd.DataFrame:
     """One line per group: IQM over seeds, its interval, and the number of seeds.
 
-    :param rows: long form, one line per run and evaluation
+    :param rows: long form, one line per run and evaluation, with the run's seed
     :param by: columns that make a group, e.g. ["panel", "method", "steps"]
     :param value: the column to summarise
     :return: columns ``by``, iqm, low, high, seeds
@@ -93,7 +93,7 @@ def summarise(rows: pd.DataFrame, by: list[str], value: str = "return") -> pd.Da
     lines = []
     for key, group in rows.groupby(by, sort=True, dropna=False):
         middle, low, high = iqm_interval(group[value].to_numpy())
-        lines.append((*key, middle, low, high, len(group)))
+        lines.append((*key, middle, low, high, group["seed"].nunique()))
     return pd.DataFrame(lines, columns=[*by, "iqm", "low", "high", "seeds"])
 
 

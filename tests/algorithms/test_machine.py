@@ -5,13 +5,16 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.wrappers import FlattenObservation, TimeLimit
+import torch as th
+from gymnasium.wrappers import FlattenObservation, TimeLimit, TransformReward
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_rpto import RPTO
-from sb3_rpto.algorithms.machine import LARGE, check_machine
+from sb3_rpto.algorithms.machine import LARGE, check_machine, doubt_rules
+from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.effects import declare
 from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.envs.rules import task_rules
 
 POLES = "InvertedDoublePendulum-v5"
 #: hinge and hinge2 (their sines, cosines and speeds) change places
@@ -93,6 +96,56 @@ def test_what_fits_is_not_doubted():
         warnings.filterwarnings("error", message="after the fit")
         made = model(shifted()).learn(45, source_timesteps=0)
     assert made._judged_target
+
+
+class Fragile(gym.Wrapper):
+    """A machine that trips at a speed which its simulator allows."""
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, reward, bool(abs(observation[2]) > 2), truncated, info
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (Fragile, r"termination_fn is not that of \d+ of 30 target transitions; pass .*'termination_fn'"),
+        (lambda env: TransformReward(env, lambda r: r + 30), r"reward_fn is not that of 30 of 30 .*'reward_fn'"),
+        (lambda env: TransformReward(env, lambda r: 1.5 * r), r"reward_fn is not that of \d+ of 30"),
+        (lambda env: env, None),
+    ],
+)
+def test_a_rule_of_the_source_that_the_target_disproves_is_told_once(change, said):
+    source, target = gym.make("Pendulum-v1"), change(gym.make("Pendulum-v1", g=12.0))
+    settings = {"dynamics_kwargs": {"hidden": (8, 8)}, "model_train_freq": 30, "seed": 0, "device": "cpu"}
+    made = RPTO("MlpPolicy", source, target_env=target, policy_kwargs={"net_arch": [4]}, source_steps=20, **settings)
+    told = "what is known of the source's task does not hold in the target"
+    with pytest.warns(UserWarning, match=f"{told}: {said}") if said else warnings.catch_warnings():
+        if said is None:
+            warnings.filterwarnings("error", message=told)
+        made.learn(60, source_timesteps=100)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=told)
+        made.learn(30, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("task", ["Hopper", "Walker2d", "Ant", "HalfCheetah", "Swimmer", "InvertedDoublePendulum"])
+def test_rules_of_a_task_hold_for_its_shifted_targets(task):
+    """The healthy heights of a walker are those of its own body."""
+    env = gym.make(f"rpto/{task}-target0-v0")
+    rules, rows = task_rules(env), []
+    observation, _ = env.reset(seed=0)
+    env.action_space.seed(0)
+    for _ in range(300):
+        action = env.action_space.sample()
+        following, reward, ended, truncated, _ = env.step(action)
+        rows.append([observation, action, reward, following, ended])
+        observation = env.reset()[0] if ended or truncated else following
+    data = Transitions(*(th.as_tensor(np.array(column), dtype=th.float32) for column in zip(*rows)))
+    assert rules.reward_fn or rules.termination_fn
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not doubt_rules(rules, data)
 
 
 def test_another_cart_pole_as_source_is_told(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +13,7 @@ import torch as th
 from conftest import SMALL_POLICY, pendulum, small
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
@@ -210,3 +212,46 @@ def test_a_source_policys_forgotten_normalisation_is_told() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         RPO.from_source(source, normalised, pendulum(12.0), device="cpu")
+
+
+def test_another_normalisation_than_the_source_policys_is_told(tmp_path: Path) -> None:
+    def made(**kwargs: Any) -> VecNormalize:
+        return VecNormalize(DummyVecEnv([pendulum]), **kwargs)
+
+    seen, settings = made(), {"device": "cpu", "policy_kwargs": SMALL_POLICY}
+    source = SAC("MlpPolicy", seen, learning_starts=10, **settings).learn(20)
+    with pytest.warns(UserWarning, match="normalised by other statistics than env's"):
+        RPO.from_source(source, made(), pendulum(12.0), device="cpu")
+    raw = SAC("MlpPolicy", pendulum(), learning_starts=10, **settings).learn(20)
+    with pytest.warns(UserWarning, match="saw raw observations, and env normalises them"):
+        RPO.from_source(raw, made(), pendulum(12.0), device="cpu")
+    RPO.from_source(source, seen, pendulum(12.0), device="cpu").save(tmp_path / "normalised.zip")
+    RPO.from_source(raw, pendulum(), pendulum(12.0), device="cpu").save(tmp_path / "raw.zip")
+    with pytest.warns(UserWarning, match="the model saw observations normalised by VecNormalize, and env is in none"):
+        RPO.load(tmp_path / "normalised.zip", env=pendulum(), device="cpu")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        RPO.from_source(raw, made(norm_obs=False), pendulum(12.0), device="cpu")
+        RPO.load(tmp_path / "normalised.zip", env=made(), device="cpu")
+        RPO.load(tmp_path / "raw.zip", env=pendulum(), device="cpu")
+        RPO.load(tmp_path / "normalised.zip", device="cpu")
+
+
+@pytest.mark.parametrize("by", ["evaluate_policy", "EvalCallback", "reset"])
+def test_steps_of_somebody_in_the_source_begin_its_episodes_anew(by: str) -> None:
+    """Else a transition would lead from one episode into another."""
+    settings = {"device": "cpu", "policy_kwargs": SMALL_POLICY, "source_steps": 7}
+    model = RPO("MlpPolicy", pendulum(), target_env=pendulum(12.0), **settings)
+    model.learn(10, source_timesteps=30)
+    callback = None
+    if by == "evaluate_policy":
+        evaluate_policy(model, model.get_env(), n_eval_episodes=1)
+    elif by == "reset":
+        model.get_env().reset()
+    else:
+        callback = EvalCallback(model.get_env(), eval_freq=4, n_eval_episodes=1, verbose=0)
+    model.learn(10, callback=callback, reset_num_timesteps=False)
+    data = model.transitions("source")
+    angle, after = (np.arctan2(x[:, 1], x[:, 0]) for x in (data.observations.numpy(), data.next_observations.numpy()))
+    moved = np.angle(np.exp(1j * (after - angle)))
+    np.testing.assert_allclose(moved, 0.05 * data.next_observations[:, 2].numpy(), atol=1e-5)  # Pendulum's own step

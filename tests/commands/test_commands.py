@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import sys
 from pathlib import Path
 
 import gymnasium as gym
 import mujoco
 import numpy as np
+import pandas as pd
 import pytest
 import torch as th
-from stable_baselines3 import SAC
+from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.save_util import load_from_pkl
 
 from sb3_rpto import RPO, RPTO, cli
 from sb3_rpto.algorithms.slbo import SLBO
-from sb3_rpto.commands import options, video
+from sb3_rpto.commands import enjoy, options, video
 from sb3_rpto.commands.plot import read_rows
 from sb3_rpto.commands.policies import load_policy
 from sb3_rpto.commands.runs import RunFolder, SavedCurve
+from sb3_rpto.experiments.report import summarise
 
 SOURCE, TARGET = "rpto/ContinuousCartPole-v0", "rpto/ContinuousCartPole-limb-x2-v0"
 SMALL_SAC = ["--set", "policy_kwargs={net_arch: [16]}", "--set", "learning_starts=20"]
@@ -271,6 +275,18 @@ BAD = {
     "train ContinuousCartPole --out O --device gpu": "--device: 'gpu' cannot be used",
     "train ContinuousCartPole --out O --every -1": "--every is -1",
     "train ContinuousCartPole": "--out",
+    "train ContinuousCartPole --out O --set seed=3": "--set seed: there is no such argument",
+    "train ContinuousCartPole --out O --set batch_size=abc": "batch_size must be a positive integer, got 'abc'",
+    "train ContinuousCartPole --out O --set gamma=0.9o": "gamma must lie in [0, 1], got '0.9o'",
+    "train ContinuousCartPole --out O --set learning_rate=lin_3e-4": "learning_rate is 'lin_3e-4'; give a number",
+    "train ContinuousCartPole --out O --set action_noise=0.1": "--set action_noise: it takes an object of Python",
+    "train ContinuousCartPole --out O --steps 100 --set learning_starts=100": "ends before the first update",
+    "train Pendulum-v1 --out O --steps 2000": "(learning_starts=10000): nothing would be learned",
+    "train CartPole-v1 --out O": "action",
+    "train FrozenLake-v1 --out O": "observation",
+    "train ContinuousCartPole --out FOREIGN": "holds a model.zip that no run of ours wrote",
+    "transfer A/model.zip T --out FOREIGN": "holds a model.zip that no run of ours wrote",
+    "transfer A/model.zip T --out O --set n_steps=3": "n_steps",
     "transfer absent.zip T --out O": "ZIP: there is no file 'absent.zip'",
     "transfer A/config.json T --out O": "is not the zip of a SAC",
     "transfer A/model.zip T --out O --source-data x.npz": "--source-data: there is no file 'x.npz'",
@@ -302,16 +318,91 @@ BAD = {
 def test_wrong_input_is_one_line_before_the_work(
     command: str, agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    names = {"O": str(tmp_path / "out"), "T": TARGET}
+    names = {"O": str(tmp_path / "out"), "T": TARGET, "FOREIGN": str(tmp_path / "foreign")}
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "model.zip").write_text("somebody's")
     given = [names.get(word, str(agent) + word[1:] if word.split("/")[0] == "A" else word) for word in command.split()]
     assert cli.main(given) == 2
     assert BAD[command] in error(capsys)
     assert not (tmp_path / "out" / "model.zip").exists()
+    assert (tmp_path / "foreign" / "model.zip").read_text() == "somebody's"
 
 
 def test_a_corrected_command_may_use_the_folder(agent: Path, tmp_path: Path) -> None:
     assert transfer(agent, tmp_path, "rpto", "--set", "weighting=papre") == 2
     assert transfer(agent, tmp_path, "rpto", "--set", "weighting=centred") == 0
+
+
+def test_what_a_killed_checkpoint_left_is_not_in_the_way(tmp_path: Path) -> None:
+    """In a container every command has the same process number."""
+    run = RunFolder(tmp_path)
+    left = tmp_path / "checkpoints" / f".{20:010d}.{os.getpid()}"
+    left.mkdir(parents=True)
+    (left / "half").write_text("")
+    run.save_checkpoint(20, lambda folder: (folder / "whole").write_text("") and None)
+    newest = run.newest_checkpoint()
+    assert newest is not None
+    assert [path.name for path in newest.iterdir()] == ["whole"]
+
+
+def test_a_run_is_the_same_from_everywhere(agent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = shutil.copytree(agent, tmp_path / "source")
+    monkeypatch.chdir(tmp_path)
+    assert transfer(Path("source"), Path("runs/moved"), "rpto") == 0
+    monkeypatch.chdir(tmp_path / "runs")
+    assert transfer(Path("../source"), Path("moved"), "rpto") == 0  # transferred already
+    config = json.loads(Path("moved/config.json").read_text())
+    assert config["source_model"] == str(Path("../../source/model.zip"))
+    known = {"source_model": config["source_model"]}
+    assert enjoy._agent_of(Path("moved"), known) is not None
+    Path("moved/config.json").write_text(json.dumps({**config, "source_model": "source/model.zip"}))  # as it once was
+    monkeypatch.chdir(tmp_path)
+    assert transfer(Path("source"), Path("runs/moved"), "rpto") == 0
+    shutil.rmtree(source)
+    with pytest.raises(FileNotFoundError, match=r"the run's source agent .* is not there; pass its zip"):
+        enjoy._agent_of(Path("runs/moved"), known)
+
+
+@pytest.mark.parametrize("kind", ["ppo", "a2c", "recurrent"])
+def test_enjoy_runs_policies_of_other_algorithms(kind: str, tmp_path: Path) -> None:
+    if kind == "recurrent":
+        contrib = pytest.importorskip("sb3_contrib")
+        small = {"lstm_hidden_size": 8, "net_arch": [8]}
+        model = contrib.RecurrentPPO("MlpLstmPolicy", "Pendulum-v1", policy_kwargs=small, seed=0, device="cpu")
+    else:
+        made = {"ppo": PPO, "a2c": A2C}[kind]
+        model = made("MlpPolicy", "Pendulum-v1", use_sde=True, policy_kwargs={"net_arch": [8]}, seed=0, device="cpu")
+    model.save(tmp_path / "model.zip")
+    env = gym.make("Pendulum-v1")
+    found = enjoy._episode(env, load_policy(tmp_path / "model.zip", "MODEL"), 3, deterministic=True)
+    observation, _ = env.reset(seed=3)
+    total, over, state = 0.0, False, None
+    while not over:
+        action, state = model.predict(observation, state, deterministic=True)
+        observation, reward, ended, truncated, _ = env.step(action)
+        total, over = total + float(reward), ended or truncated
+    assert found == pytest.approx(total, rel=1e-5)
+
+
+def test_plot_counts_seeds_and_tells_settings_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def finished(name: str, seed: int, **settings: object) -> Path:
+        config = {"method": "rpto", "target": TARGET, "seed": seed, "settings": settings}
+        (tmp_path / name).mkdir()
+        file = tmp_path / name / "result.json"
+        file.write_text(json.dumps({"config": config, "rows": [{"steps": 20, "return": float(seed)}]}))
+        return file
+
+    files = [finished("a", 0), finished("b", 1), finished("c", 0, gradient_steps=20)]
+    (tmp_path / "unfinished").mkdir()
+    (tmp_path / "unfinished" / "config.json").write_text("{}")
+    found = read_rows([tmp_path, *files])
+    assert sorted((row["method"], row["seed"]) for row in found) == [
+        *(("rpto gradient_steps=20", 0), ("rpto gradient_steps=default", 0), ("rpto gradient_steps=default", 1))
+    ]
+    assert capsys.readouterr().err == f"sb3-rpto: left out, not finished: {tmp_path / 'unfinished'}\n"
+    assert [row["method"] for row in read_rows(files[:2])] == ["rpto", "rpto"]
+    twice = pd.DataFrame([*read_rows(files[:2]), *read_rows(files[:1])])
+    assert summarise(twice, ["method", "steps"])["seeds"].tolist() == [2]
 
 
 @pytest.mark.parametrize(
@@ -324,6 +415,7 @@ def test_a_corrected_command_may_use_the_folder(agent: Path, tmp_path: Path) -> 
 def test_values_of_settings_are_what_python_users_mean(text: str, value: object) -> None:
     assert options.setting(f"name={text}") == ("name", value)
     assert type(options.setting(f"name={text}")[1]) is type(value)
+    assert options.setting("train_freq=[1, episode]") == ("train_freq", (1, "episode"))  # YAML has no tuples
 
 
 def test_source_transitions_are_for_methods_with_a_use_for_them(

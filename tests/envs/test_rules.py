@@ -144,6 +144,21 @@ def test_a_double_pendulum_of_another_build_has_no_rule():
     assert task_rules(env) == TaskRules(None, None)
 
 
+def test_a_walker_with_a_health_of_its_own_has_no_rule():
+    from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
+
+    class Low(HopperEnv):
+        @property
+        def is_healthy(self):
+            return bool(self.data.qpos[1] > 0.4)
+
+    class Same(HopperEnv):
+        colour = "red"
+
+    assert task_rules(Low()) == TaskRules(None, None)
+    assert task_rules(Same()).termination_fn is not None
+
+
 @pytest.mark.parametrize("name", ["Hopper-v5", "HalfCheetah-v5", "InvertedDoublePendulum-v5", "Pendulum-v1"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_next_observation_that_is_not_finite_is_terminal(name, value):
