@@ -111,6 +111,10 @@ def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: options.Wo
     source = options.world(name, "--source")
     policy = load_policy(agent, "--source-model")
     _check_spaces(policy, source, "--source-model", "--source")
+    trial = target.make(render_mode="rgb_array")
+    trial.reset(seed=0)
+    trial.render()
+    trial.close()
     return policy, source
 
 
