@@ -117,10 +117,14 @@ def test_every_logged_key_is_explained_and_every_explained_key_is_logged(tmp_pat
     keys |= logged(model)
     monkeypatch.setattr(closing, "FIRST", 80)
     monkeypatch.setattr(closing, "FILL", 25)
-    monkeypatch.setattr(closing, "FRESH", 25)
     double = "InvertedDoublePendulum-v5"
     target = apply_effects(gym.make(double), [LIBRARY["coulomb_friction"]("slider", level=5.0)])
-    settings = {"declared": ["pole.length"], "close_loop": ["coulomb_friction"], "model_train_freq": 40}
+    settings = {
+        "declared": ["pole.length"],
+        "close_loop": ["coulomb_friction"],
+        "model_train_freq": 40,
+        "retrain_steps": 25,
+    }
     keys |= logged(small(RPTO, gym.make(double), target, dynamics="physical", weighting=None, **settings))
     names = {"gravity", "pole_length", "pole.length", "coulomb_friction(slider).level"}
     patterns = {key: re.escape(key).replace("<name>", f"({'|'.join(map(re.escape, names))})") for key in explained()}

@@ -119,8 +119,8 @@ def test_close_the_loop_names_what_is_in_the_target(monkeypatch, tmp_path, capsy
     agent.save_replay_buffer(tmp_path / "source_0_data.pkl")
     trace = closing.trace
     monkeypatch.setattr(closing, "trace", lambda *a, **k: trace(*a, **{**k, "candidates": ["coulomb_friction"]}))
-    monkeypatch.setattr(closing, "FRESH", 25)
-    monkeypatch.setattr(sys, "argv", ["close_the_loop.py", "--steps", "202", "--out", str(tmp_path)])
+    few = ["--steps", "202", "--retrain-steps", "25"]
+    monkeypatch.setattr(sys, "argv", ["close_the_loop.py", *few, "--out", str(tmp_path)])
     example.main()
     true = {effect.label: effect.values for effect in example.shifted("double-pendulum", "undeclared", 0)}
     found = {effect.label: effect.values for effect in load_corrected(tmp_path).effects}

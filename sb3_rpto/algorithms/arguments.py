@@ -36,6 +36,7 @@ DYNAMICS_ARGUMENTS = frozenset(
         "dynamics_kwargs",
         "declared",
         "close_loop",
+        "retrain_steps",
         "weighting",
         "weight_floor",
         "rollout_start",
@@ -45,7 +46,7 @@ DYNAMICS_ARGUMENTS = frozenset(
 #: What :func:`check_values` looks at beside the name of the dynamics.
 CHECKED = (
     *("weighting", "rollout_start", "real_ratio", "weight_floor", "tau", "gamma", "source_steps", "model_train_freq"),
-    *("gradient_steps", "target_update_interval", "batch_size", "buffer_size", "train_freq"),
+    *("gradient_steps", "target_update_interval", "batch_size", "buffer_size", "train_freq", "retrain_steps"),
 )
 #: What stands for target steps in an offline run has no use for these.
 ONLINE = frozenset({"action_noise", "train_freq"})
@@ -158,6 +159,7 @@ def check_values(
     batch_size: Any,
     buffer_size: Any,
     train_freq: Any,
+    retrain_steps: Any,
 ) -> None:
     """Refuse names that do not exist and numbers out of range; arguments as those of the algorithms.
 
@@ -184,6 +186,8 @@ def check_values(
         train_freq=train_freq,
     )
     _check_counts(source_steps=source_steps, model_train_freq=model_train_freq)
+    if not _is_integer(retrain_steps) or retrain_steps < 0:
+        raise ValueError(f"retrain_steps must be an integer and not negative, got {retrain_steps!r}")
 
 
 def check_sac_values(

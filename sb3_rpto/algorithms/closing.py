@@ -48,8 +48,8 @@ WORTH = 0.9
 #: Source steps that fill D_source anew.
 FILL = 1_000
 #: Then the policy learns in the corrected simulator what it can for nothing, before the next target step: in rounds of
-#: so many source steps, until so many rounds in a row earned no more than the best one, or all these steps are taken.
-ROUND, PATIENCE, FRESH = 20_000, 2, 100_000
+#: so many source steps, until so many in a row earned no more than the best one, or ``retrain_steps`` are taken.
+ROUND, PATIENCE = 20_000, 2
 #: Another simulator made D_source where the present one errs by so much on the oldest so many of its transitions.
 OTHER, OLDEST = 0.02, 500
 #: Width of a normal distribution's 95 % interval, in standard deviations.
@@ -432,9 +432,9 @@ def learn_in_source(model: Looping, rehearse: Callable[[], None]) -> None:
     source = model._source_world
     assert isinstance(source, EpisodeSource)
     best, idle, steps = -math.inf, 0, 0
-    while steps < FRESH and idle < PATIENCE:
+    while steps < model.retrain_steps and idle < PATIENCE:
         source.returns.clear()
-        end = min(steps + ROUND, FRESH)
+        end = min(steps + ROUND, model.retrain_steps)
         while steps < end:
             steps += learn_for_a_step(model)
         # Where no episode ended there is nothing to judge by, and learning goes on.

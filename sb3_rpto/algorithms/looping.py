@@ -19,6 +19,8 @@ class Looping(Resumable):
 
     #: what to look for, as the user asked
     close_loop: bool | Sequence[str]
+    #: source steps that may follow a trace
+    retrain_steps: int
     #: the robot's log, where one was given
     measured: Measurements | None
     #: step 3 of a round is done, its steps 5 and 6 are not

@@ -12,7 +12,7 @@ from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.envs.rules import env_id
 
 #: Arguments of RPTO that have no meaning where the model is fitted without weights and nothing is declared.
-UNUSED = frozenset({"preset", "dynamics", "declared", "close_loop", "weighting", "weight_floor"})
+UNUSED = frozenset({"preset", "dynamics", "declared", "close_loop", "retrain_steps", "weighting", "weight_floor"})
 
 
 class MBPO(TransferAlgorithm):

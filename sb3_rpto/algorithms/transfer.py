@@ -62,6 +62,8 @@ class TransferAlgorithm(Looping):
         (``dynamics="physical"`` on MuJoCo); a list looks for effects of these kinds alone, an empty one for
         none, so that the declared numbers are traced and the policy learns on. The reports are in
         ``model.loop.reports`` (with Measurements also where only the declared numbers are fitted)
+    :param retrain_steps: source steps after a trace, at most: in the corrected simulator, before the next target step,
+        as long as the policy gets better there. Some get much better with 300,000 (docs/results.md, Hopper)
     :param weighting: RTO's weight: "paper", "centred", "value_aware", or None (plain supervised learning)
     :param weight_floor: epsilon of the paper: the smallest weight, above 0 or equal to it
     :param real_ratio: share of target transitions in the critic's batches, in [0, 1); 0 in the paper
@@ -122,6 +124,7 @@ class TransferAlgorithm(Looping):
         dynamics_kwargs: dict[str, Any] | None = None,
         declared: Sequence[str] = (),
         close_loop: bool | Sequence[str] = False,
+        retrain_steps: int = 100_000,
         weighting: WeightingName | None = "paper",
         weight_floor: float = 0.5,
         real_ratio: float = 0.05,
@@ -170,7 +173,7 @@ class TransferAlgorithm(Looping):
         self.dynamics_backend = dynamics
         self.dynamics_kwargs = arguments.plain_effects(dynamics_kwargs or {})
         self.declared = arguments.list_of_names(declared)
-        self.close_loop = close_loop
+        self.close_loop, self.retrain_steps = close_loop, retrain_steps
         #: traces what the simulator lacks, and holds the reports; None with the loop open and no log to trace on
         self.loop = None if close_loop is False else LoopCloser(self.declared, close_loop)
         self.weighting = weighting

@@ -31,6 +31,7 @@ VALUES = {
     "batch_size": 256,
     "buffer_size": 1_000,
     "train_freq": (1, "step"),
+    "retrain_steps": 0,
 }
 
 
@@ -66,6 +67,8 @@ def test_what_is_allowed_passes():
         ("real_ratio", 1.0),
         ("real_ratio", -0.1),
         ("weight_floor", -1e-9),
+        ("retrain_steps", -1),
+        ("retrain_steps", 2.5),
         ("source_steps", "auto"),
         ("source_steps", 0),
         ("model_train_freq", 2.5),

@@ -49,7 +49,7 @@ def model(lacks: list[Effect], cls: type = RPTO, **kwargs: object) -> RPTO:
     settings: dict[str, object] = {
         **{"dynamics": "physical", "declared": ["pole.length"], "close_loop": KINDS, "seed": 0, "device": "cpu"},
         **{"source_steps": 4, "gradient_steps": 1, "weighting": None, "model_train_freq": 40, "batch_size": 32},
-        **{"target_env": None if "target_data" in kwargs else target(lacks)},
+        **{"target_env": None if "target_data" in kwargs else target(lacks), "retrain_steps": 25},
         **kwargs,
     }
     return cls("MlpPolicy", gym.make(TASK), **settings)
@@ -59,7 +59,6 @@ def model(lacks: list[Effect], cls: type = RPTO, **kwargs: object) -> RPTO:
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closing, "FIRST", 80)
     monkeypatch.setattr(closing, "FILL", 25)
-    monkeypatch.setattr(closing, "FRESH", 25)
 
 
 @cache
@@ -67,7 +66,6 @@ def learned() -> RPTO:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(closing, "FIRST", 80)
         patch.setattr(closing, "FILL", 25)
-        patch.setattr(closing, "FRESH", 25)
         return model(friction()).learn(100, source_timesteps=100)
 
 
@@ -151,7 +149,6 @@ def learned_from_noise() -> RPTO:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(closing, "FIRST", 120)
         patch.setattr(closing, "FILL", 25)
-        patch.setattr(closing, "FRESH", 25)
         passed = {"observation_noise": noise.tolist()}
         made = model([], target_env=noisy(noise), dynamics_kwargs=passed, close_loop=["coulomb_friction"])
         return made.learn(170, source_timesteps=180)
@@ -507,7 +504,6 @@ def test_learning_in_the_corrected_simulator_that_was_interrupted_is_counted_and
     assert made.loop.stale
     before = made.source_timesteps
     monkeypatch.undo()
-    monkeypatch.setattr(closing, "FRESH", 25)
     monkeypatch.setattr(closing, "FILL", 25)
     made.learn(1, reset_num_timesteps=False)
     assert not made.loop.stale
@@ -613,13 +609,13 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
     earns: list[float], rounds: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(closing, "ROUND", 20)
-    monkeypatch.setattr(closing, "FRESH", 160)
     updates: list[int] = []
     source = Scripted(earns)
     made = SimpleNamespace(
         _source_world=source,
         updates_per_step=30,
         source_steps=20,
+        retrain_steps=160,
         batch_size=32,
         source_timesteps=5,
         verbose=0,
