@@ -20,9 +20,11 @@ from sb3_rpto.tracing.columns import columns_of
 #: A fitted simulator should err by less than this share of a standard one-step change. Shifted tasks end below 0.15
 #: (tests and benchmarks; observation noise of a hundredth included), joints in another order above 0.53.
 LARGE = 0.5
-#: A known reward is another one where it errs by so much of the rewards' deviation, a float's rounding apart; more than
-#: so many transitions, and so many of all, must say so.
-FAR, ROUNDING, FEW, FEW_OF_ALL = 0.1, 1e-3, 2, 0.01
+#: A known reward is another one where it errs by so much of the rewards' deviation, a float's rounding apart, on more
+#: than this share of all transitions; a termination where it errs on more than this share of what ends by either.
+FAR, ROUNDING, MANY, MOST = 0.1, 1e-3, 0.1, 0.5
+#: And on more transitions than these.
+FEW = 2
 
 
 def check_machine(source: VecEnv, target: VecEnv) -> None:
@@ -104,7 +106,7 @@ def doubt(dynamics: Dynamics, error: float) -> None:
 def doubt_rules(dynamics: Dynamics, data: Transitions) -> bool:
     """Warn of a known rule that is not the target's, and say whether there is one.
 
-    Few transitions that differ may be those at a threshold, where observations are rounded.
+    Few that differ may be those at a threshold, where observations are rounded or noisy.
 
     :param dynamics: with ``reward_fn`` and ``termination_fn``, where they are known
     :param data: D_target
@@ -114,16 +116,19 @@ def doubt_rules(dynamics: Dynamics, data: Transitions) -> bool:
         rule = getattr(dynamics, name, None)
         if rule is None or not len(data):
             continue
-        far = 0.5 if name == "termination_fn" else FAR * float(recorded.std(correction=0)) + ROUNDING
         answers = rule(*given).reshape(len(data)).to(recorded)
+        if name == "termination_fn":
+            far, enough = 0.5, MOST * int(((answers > 0) | (recorded > 0)).sum())
+        else:
+            far, enough = FAR * float(recorded.std(correction=0)) + ROUNDING, MANY * len(data)
         wrong = int(((answers - recorded).abs() > far + ROUNDING * recorded.abs()).sum())
-        if wrong > max(FEW, FEW_OF_ALL * len(data)):
+        if wrong > max(FEW, enough):
             said.append(f"{name} is not that of {wrong} of {len(data)} target transitions")
     if said:
         name = said[0].partition(" ")[0]
         warnings.warn(
             f"what is known of the source's task does not hold in the target: {' and '.join(said)}; pass the target's "
-            f"rule by dynamics_kwargs={{'{name}': ...}}, or None to have it learned",
+            f"rule by dynamics_kwargs={{'{name}': ...}}, or None to have it learned (very noisy sensors look alike)",
             stacklevel=3,
         )
     return bool(said)

@@ -84,7 +84,7 @@ def carry_over(sac: SAC, model: Resumable, temperature: bool = True) -> None:
             "policy is another action now",
             stacklevel=3,
         )
-    if sac.get_env() is not None:  # a zip does not tell
+    if sac.get_env() is not None and sac._last_obs is not None:  # it has learned there; a zip does not tell
         learned = sac.get_vec_normalize_env()
         check_normalisation(normalises(learned), model.get_vec_normalize_env(), "source_model", learned)
     try:

@@ -135,6 +135,11 @@ def check_sac(settings: dict[str, Any]) -> None:
     rate = own["learning_rate"]
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not rate > 0:
         raise ValueError(f"--set learning_rate is {rate!r}; give a number above 0 (schedules: the Python interface)")
+    first = own["learning_starts"]
+    if isinstance(first, bool) or not isinstance(first, int) or first < 0:
+        raise ValueError(f"--set learning_starts is {first!r}; give a number of steps")
+    if own["optimize_memory_usage"]:
+        raise ValueError("--set optimize_memory_usage: a transfer needs the next observations; leave it out")
     for name in ("action_noise", "replay_buffer_class", "replay_buffer_kwargs"):
         if own[name] is not None:
             raise ValueError(f"--set {name}: it takes an object of Python; use the Python interface")

@@ -112,10 +112,16 @@ def _result(file: Path) -> list[dict[str, Any]] | None:
             of_run["seed"] = content["job"]["seed"]
         else:
             of_run = {name: content["config"][name] for name in ("method", "target", "seed")}
-        of_run["settings"] = content.get("config", {}).get("settings", {})
+        of_run["settings"] = _chosen(content.get("config", {}))
         return [{**of_run, "steps": row["steps"], "return": row["return"]} for row in content["rows"]]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         return None
+
+
+def _chosen(config: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a run but a buffer as long as the run, which the command made so."""
+    settings = config.get("settings", {})
+    return {n: value for n, value in settings.items() if n != "buffer_size" or value != config.get("steps")}
 
 
 def draw(axes: Any, rows: pd.DataFrame, title: str) -> None:

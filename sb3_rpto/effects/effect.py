@@ -170,8 +170,6 @@ class Effect:
     def bind(self, model: mujoco.MjModel) -> None:
         """Look up the ids of the place: ``self.dof`` and ``self.adr`` of a joint, ``self.index`` of anything.
 
-        ``self.ctrl`` is the address of an actuator's command.
-
         :raises ValueError: the model has no such object, or the effect cannot sit on it, see :meth:`places`
         """
         if self.place in ("joint", "sensor"):
@@ -180,10 +178,15 @@ class Effect:
         elif self.place != "world":
             self.index = object_id(model, self.place, self.on)
         if self.place == "actuator":
-            self.ctrl = int(model.actuator_ctrladr[self.index])
+            self._ctrl = int(model.actuator_ctrladr[self.index])
         # Which geoms touch, and whether there is a fluid or gravity, follows from numbers that other effects change.
         if self.place not in ("geom", "world") and self.on not in self.places(model):
             raise ValueError(f"{self.kind} cannot sit on {self.place} {self.on!r}: {self.why_not(model)}")
+
+    @property
+    def ctrl(self) -> int:
+        """Address of the actuator's command in ``ctrl``, which is its id unless actuators take several."""
+        return int(vars(self).get("_ctrl", self.index))
 
     def why_not(self, model: mujoco.MjModel) -> str:
         """What to say of an object that :meth:`places` leaves out."""

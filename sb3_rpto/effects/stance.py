@@ -24,13 +24,14 @@ class Stance:
     are left alone.
 
     :param base: an unwrapped gymnasium MuJoCo environment, as it stands before
-    :param before: :func:`nominal_heights` of the model before, where that of ``base`` has changed already
+    :param before: :func:`nominal_heights` of the model before, where that of ``base`` has changed already; of use where
+        episodes begin in the reference pose
     """
 
     def __init__(self, base: Any, before: tuple[float, float] | None = None) -> None:
         self._joint = _vertical(base.model) if hasattr(base, "init_qpos") else None
         found = None if self._joint is None else _heights(base.model, self._joint, base.init_qpos)
-        if found is not None and before is not None:
+        if found is not None and before is not None and np.allclose(base.init_qpos, base.model.qpos0):
             found = before
         if found is None:
             self._joint = None

@@ -84,7 +84,7 @@ def unwrap(angle: np.ndarray, change: np.ndarray | None = None) -> tuple[np.ndar
     """Undo the wrapping of an angle to one turn.
 
     Only a signal that stays within one turn (and 1 % for rounding) is taken as wrapped, where it jumps by nearly a
-    whole one (within a quarter turn), or by whole ones more than its velocity says.
+    whole one (within a quarter turn). Where many steps are of about half a turn, its velocity says which way they went.
 
     :param angle: in rad, shape (T,)
     :param change: of the angle from each sample to the next by its measured velocity, shape (T - 1,); None without one
@@ -95,11 +95,12 @@ def unwrap(angle: np.ndarray, change: np.ndarray | None = None) -> tuple[np.ndar
     if np.ptp(angle) > 1.01 * TURN:
         return angle, 0, False
     jumps = np.where(np.abs(np.abs(steps) - TURN) < TURN / 4, np.sign(steps), 0.0)
-    fast = float(np.mean(np.abs(np.abs(steps) - TURN / 2) < TURN / 4)) > FAST
-    if change is not None and np.abs(change).max(initial=0.0) > TURN / 4:
+    open_ = np.abs(np.abs(steps) - TURN / 2) < TURN / 4  # of about half a turn: either way is as near
+    fast = float(np.mean(open_)) > FAST
+    if fast and change is not None:
         told = np.round((steps - change) / TURN)
-        if np.quantile(np.abs(steps - change - TURN * told), 0.95) < TURN / 8:
-            jumps, fast = told, False
+        if (np.abs(steps - change - TURN * told)[open_] < TURN / 8).all():
+            jumps, fast = np.where(open_, told, jumps), False
     count = int(np.count_nonzero(jumps))
     return angle - TURN * np.concatenate([[0.0], np.cumsum(jumps)]) if count else angle, count, fast
 
@@ -243,7 +244,22 @@ def turning_slope(time: np.ndarray, quaternions: np.ndarray, velocity: np.ndarra
     :param quaternions: unit ones, w first, neighbours of near sign, shape (T, 4)
     :param velocity: in rad/s, shape (T, 3)
     """
-    return _slope(angular_velocity(time, quaternions).ravel(), velocity.ravel())
+    if np.sum(np.diff(velocity, axis=0) ** 2) > np.sum(velocity[1:] ** 2):
+        return None  # so few samples a swing do not tell how far it turned
+    conjugate = quaternions * np.array([1.0, -1.0, -1.0, -1.0])
+    turned = np.array([_product(a, b) for a, b in zip(conjugate[:-1], quaternions[1:])])
+    length = np.linalg.norm(turned[:, 1:], axis=1, keepdims=True)
+    angle = 2 * np.arctan2(length, turned[:, :1])
+    moved = turned[:, 1:] * np.divide(angle, length, out=np.full_like(angle, 2.0), where=length > 1e-9)
+    said = 0.5 * np.diff(time)[:, None] * (velocity[1:] + velocity[:-1])
+    span = min(SPAN, len(time) // 2)
+    sums = (np.cumsum(np.concatenate([np.zeros((1, 3)), x]), axis=0) for x in (moved, said))
+    return _slope(*((x[span:] - x[:-span]).ravel() for x in sums))
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of two quaternions, w first."""
+    return np.concatenate([[a[0] * b[0] - a[1:] @ b[1:]], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
 
 
 def _slope(moved: np.ndarray, said: np.ndarray) -> float | None:

@@ -12,10 +12,8 @@ from sb3_rpto.effects.simulation import prepare
 from sb3_rpto.effects.world import BatchWorld
 from sb3_rpto.tracing.checks import MIN_ROWS
 from sb3_rpto.tracing.episodes import Episode
-from sb3_rpto.tracing.evaluate import predictions
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.residuals import ForceResidual, force_residuals
-from sb3_rpto.tracing.starts import straight
 from sb3_rpto.tracing.windows import Windows, cut
 
 
@@ -23,8 +21,8 @@ def missing_forces(simulation: Simulation, values: np.ndarray, data: Measurement
     r"""What is missing in every episode that is long enough.
 
     By inverse dynamics; but exact samples are a simulator's, as far apart as the decisions of a policy, and their
-    differences no accelerations. There it is the force that makes the model arrive at the next sample, :math:`M(q)\,
-    (q_{t+1} - \hat q_{t+1}) / s`, where :math:`s` is how far an acceleration of one leads until then.
+    differences no accelerations. There it is the force that lets the model arrive at the next sample's velocities,
+    :math:`M(q)\,(\dot q_{t+1} - \hat{\dot q}_{t+1}) / \Delta t`.
 
     :param simulation: the model with its effects
     :param values: their parameters, (p,)
@@ -35,7 +33,7 @@ def missing_forces(simulation: Simulation, values: np.ndarray, data: Measurement
         return found
     episodes = (e for e in data.episodes if len(e) >= MIN_ROWS)
     by_step = [_step_by_step(simulation, values, data, r, e) for r, e in zip(found, episodes)]
-    return [r for r in by_step if len(r.time)]
+    return [r for r in by_step if len(r.time) > 1]
 
 
 def _step_by_step(
@@ -46,28 +44,21 @@ def _step_by_step(
         windows = cut(simulation.model, replace(data, episodes=[e]), np.ones(e.qpos.shape[1]), 2 * h, len(e), 0.5)
     except ValueError:  # no two steps of known states
         return _rows(r, np.empty(0, dtype=int))
-    _, difference, usable = predictions(simulation, values, windows)
+    one_each = np.tile(values, (len(windows), 1))
+    qpos, qvel = windows.qpos.copy(), windows.qvel.copy()
+    simulation.undo_sensors(one_each, qpos, qvel, windows.qacc)
+    _, predicted = simulation.rollout(one_each, qpos, qvel, windows.drive)
     row = np.rint((windows.time - e.time[0] - r.time[0]) / h).astype(int)
-    kept = np.flatnonzero(usable[:, 0] & (row >= 0) & (row < len(r.time)))
-    force = np.zeros((len(windows), simulation.model.nv))
-    dof_of = straight(simulation.model)
-    for column, address in enumerate(windows.columns):
-        if int(address) in dof_of:
-            force[:, dof_of[int(address)]] = -difference[:, 0, column] / _reach(simulation.model, windows)
-    force = np.einsum("wij,wj->wi", _inertia(simulation, values, windows), force)
-    return replace(_rows(r, row[kept]), force=force[kept])
+    # The next window begins at the next sample.
+    kept = np.flatnonzero((np.diff(row) == 1) & (row[:-1] >= 0) & (row[:-1] < len(r.time)))
+    steps = np.rint(windows.at[kept, 0]).astype(int)
+    rate = (qvel[kept + 1] - predicted[kept, steps]) / (steps * simulation.model.opt.timestep)[:, None]
+    force = np.einsum("wij,wj->wi", _inertia(simulation, values, windows.take(kept)), rate)
+    return replace(_rows(r, row[kept]), force=force)
 
 
 def _rows(r: ForceResidual, rows: np.ndarray) -> ForceResidual:
     return replace(r, **{n: getattr(r, n)[rows] for n in ("time", "qpos", "qvel", "load", "command", "force")})
-
-
-def _reach(model: mujoco.MjModel, windows: Windows) -> np.ndarray:
-    """How far an acceleration of one leads until the first sample of each window, in s^2, (W,)."""
-    dt, steps = float(model.opt.timestep), windows.at[:, 0]
-    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        return (dt * steps) ** 2 / 2
-    return dt**2 * steps * (steps + 1) / 2  # Euler's method moves by the velocity at the end of a step
 
 
 def _inertia(simulation: Simulation, values: np.ndarray, windows: Windows) -> np.ndarray:

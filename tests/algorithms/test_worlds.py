@@ -232,6 +232,9 @@ def test_another_normalisation_than_the_source_policys_is_told(tmp_path: Path) -
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         RPO.from_source(raw, made(norm_obs=False), pendulum(12.0), device="cpu")
+        source.save(tmp_path / "sac.zip")
+        loaded = SAC.load(tmp_path / "sac.zip", env=pendulum(), device="cpu")  # it has learned elsewhere
+        RPO.from_source(loaded, seen, pendulum(12.0), device="cpu")
         RPO.load(tmp_path / "normalised.zip", env=made(), device="cpu")
         RPO.load(tmp_path / "raw.zip", env=pendulum(), device="cpu")
         RPO.load(tmp_path / "normalised.zip", device="cpu")

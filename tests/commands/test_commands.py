@@ -282,6 +282,8 @@ BAD = {
     "train ContinuousCartPole --out O --set action_noise=0.1": "--set action_noise: it takes an object of Python",
     "train ContinuousCartPole --out O --steps 100 --set learning_starts=100": "ends before the first update",
     "train Pendulum-v1 --out O --steps 2000": "(learning_starts=10000): nothing would be learned",
+    "train ContinuousCartPole --out O --set learning_starts=abc": "--set learning_starts is 'abc'",
+    "train ContinuousCartPole --out O --set optimize_memory_usage=true": "--set optimize_memory_usage",
     "train CartPole-v1 --out O": "action",
     "train FrozenLake-v1 --out O": "observation",
     "train ContinuousCartPole --out FOREIGN": "holds a model.zip that no run of ours wrote",
@@ -395,12 +397,17 @@ def test_plot_counts_seeds_and_tells_settings_apart(tmp_path: Path, capsys: pyte
     files = [finished("a", 0), finished("b", 1), finished("c", 0, gradient_steps=20)]
     (tmp_path / "unfinished").mkdir()
     (tmp_path / "unfinished" / "config.json").write_text("{}")
+    (tmp_path / "another.json").write_text(json.dumps({"config": 3, "rows": [], "job": 1, "target": {}}))
     found = read_rows([tmp_path, *files])
     assert sorted((row["method"], row["seed"]) for row in found) == [
         *(("rpto gradient_steps=20", 0), ("rpto gradient_steps=default", 0), ("rpto gradient_steps=default", 1))
     ]
     assert capsys.readouterr().err == f"sb3-rpto: left out, not finished: {tmp_path / 'unfinished'}\n"
     assert [row["method"] for row in read_rows(files[:2])] == ["rpto", "rpto"]
+    for steps in (60, 80):  # a buffer as long as the run is the command's own
+        config = {"method": "sac", "target": TARGET, "seed": steps, "steps": steps, "settings": {"buffer_size": steps}}
+        (tmp_path / f"{steps}.json").write_text(json.dumps({"config": config, "rows": [{"steps": 20, "return": 1.0}]}))
+    assert {row["method"] for row in read_rows([tmp_path / "60.json", tmp_path / "80.json"])} == {"sac"}
     twice = pd.DataFrame([*read_rows(files[:2]), *read_rows(files[:1])])
     assert summarise(twice, ["method", "steps"])["seeds"].tolist() == [2]
 

@@ -261,6 +261,22 @@ def test_a_walker_that_is_loaded_stands_as_the_one_that_was_saved(tmp_path):
                 np.testing.assert_allclose(mine, theirs, atol=1e-4)  # the file has six digits
 
 
+def test_a_walker_that_begins_in_a_pose_of_its_own_is_left_there(tmp_path):
+    from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
+
+    def crouched(**kwargs):
+        env = HopperEnv(**kwargs)
+        env.init_qpos = env.init_qpos.copy()
+        env.init_qpos[[1, 3, 4, 5]] = 0.95, -0.8, -1.2, 0.4
+        return env
+
+    save_corrected(tmp_path, crouched(), [CoulombFriction("leg_joint", level=1.0)])
+    for env in (crouched(), crouched(xml_file=str(tmp_path / "model.xml"))):
+        base = load_corrected(tmp_path).apply(env).unwrapped
+        assert base.init_qpos[1] == pytest.approx(0.95)
+        assert base._healthy_z_range[0] == pytest.approx(0.7)
+
+
 def test_the_applied_one_steps_as_the_saved_one(tmp_path):
     env, twin = gym.make(POLE), gym.make(POLE)
     chosen = [

@@ -14,9 +14,10 @@ from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.missing import missing_forces
-from sb3_rpto.tracing.residuals import ForceResidual, force_residuals, summary
+from sb3_rpto.tracing.residuals import ForceResidual, force_residuals, learnable_share, summary
 
 RATE, LEVEL = 25, 0.15  # Hz, N·m
+ARRAYS = ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable")
 
 
 def decided(planted: list[Effect], model: mujoco.MjModel | None = None) -> Measurements:
@@ -38,7 +39,7 @@ def test_a_constant_torque_shows_as_what_it_is(integrator: str) -> None:
     assert len(found) == 3
     for r in found:
         assert len(r.time) > 90
-        assert np.median(r.force) == pytest.approx(LEVEL, rel=0.03)  # damping takes its part within a step
+        assert np.median(r.force) == pytest.approx(LEVEL, rel=0.05)  # damping takes its part within a step
         np.testing.assert_allclose(r.force, LEVEL, rtol=0.25)
 
 
@@ -76,7 +77,7 @@ def test_every_row_is_that_of_inverse_dynamics_but_for_the_force() -> None:
     for r, plain in zip(missing(data), force_residuals(simulation, np.empty(0), data)):
         assert r.episode == plain.episode
         for name in ("time", "qpos", "qvel", "load", "command"):
-            np.testing.assert_array_equal(getattr(r, name), getattr(plain, name))
+            np.testing.assert_array_equal(getattr(r, name), getattr(plain, name)[:-1])  # the last leads nowhere
 
 
 def test_unknown_states_are_left_out() -> None:
@@ -89,6 +90,41 @@ def test_unknown_states_are_left_out() -> None:
     assert set(rows) > set(range(5, 38)) | set(range(52, 90))
     unknown = replace(e, usable=np.zeros(len(e), dtype=bool))
     assert missing(replace(data, episodes=[unknown])) == []
+
+
+FLOATING = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body name="base">{free}
+  <geom type="box" size=".1 .1 .1" mass="1" contype="0" conaffinity="0"/>
+  <body name="arm"><joint name="hinge" axis="0 1 0" damping="0.01"/>
+  <geom type="capsule" fromto="0 0 0 .4 0 0" size=".03" mass="1" contype="0" conaffinity="0"/></body>
+  </body></worldbody><actuator><motor name="m" joint="hinge"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("free", ["", '<freejoint name="root"/>'])
+def test_a_robot_that_floats_lacks_what_one_lacks_that_is_bolted_down(free: str) -> None:
+    """What moves the base is no force on it: the joint's torque moves both."""
+    model = mujoco.MjModel.from_xml_string(FLOATING.format(free=free))
+    rng, mj, rows = np.random.default_rng(0), mujoco.MjData(model), []
+    for _ in range(100):
+        mj.ctrl[:] = rng.uniform(-0.1, 0.1)
+        rows.append([mj.time, *mj.qpos, *mj.qvel, *mj.ctrl])
+        mj.qfrc_applied[-1] = 0.02
+        mujoco.mj_step(model, mj, 4)
+    named = [*([f"root.{i}" for i in range(7)] if free else []), "hinge"]
+    moved = [*([f"root.{i}" for i in range(6)] if free else []), "hinge"]
+    names = ["time", *(f"qpos.{n}" for n in named), *(f"qvel.{n}" for n in moved), "ctrl.m"]
+    data = replace(Measurements.from_tables({"a": dict(zip(names, np.array(rows).T))}), exact=True)
+    (found,) = missing(data, model=model)
+    np.testing.assert_allclose(found.force[:, -1], 0.02, rtol=0.05)
+    assert np.abs(found.force[:, :-1]).max(initial=0.0) < 0.005  # the inertia changes within a step
+
+
+def test_the_shortest_episodes_are_left_out() -> None:
+    data = decided([TorqueOffset("hinge", offset=LEVEL)])
+    short = [replace(e, **{n: getattr(e, n)[:rows] for n in ARRAYS}) for e, rows in zip(data.episodes, (5, 6, 9))]
+    found = missing(replace(data, episodes=short))
+    assert all(len(r.time) > 1 for r in found)
+    assert [r.episode for r in found] == [e.name for e in short[1:]]
+    learnable_share(found, 0)
 
 
 def test_noisy_samples_are_differentiated() -> None:
