@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
 
 MIN_ROWS = 5
 """Fewest samples of a run: a cubic needs four points, one more leaves something to smooth."""
@@ -95,12 +96,12 @@ def unwrap(angle: np.ndarray, change: np.ndarray | None = None) -> tuple[np.ndar
     if np.ptp(angle) > 1.01 * TURN:
         return angle, 0, False
     jumps = np.where(np.abs(np.abs(steps) - TURN) < TURN / 4, np.sign(steps), 0.0)
-    open_ = np.abs(np.abs(steps) - TURN / 2) < TURN / 4  # of about half a turn: either way is as near
-    fast = float(np.mean(open_)) > FAST
+    unsure = np.abs(np.abs(steps) - TURN / 2) < TURN / 4  # of about half a turn: either way is as near
+    fast = float(np.mean(unsure)) > FAST
     if fast and change is not None:
         told = np.round((steps - change) / TURN)
-        if (np.abs(steps - change - TURN * told)[open_] < TURN / 8).all():
-            jumps, fast = np.where(open_, told, jumps), False
+        if (np.abs(steps - change - TURN * told)[unsure] < TURN / 8).all():
+            jumps, fast = np.where(unsure, told, jumps), False
     count = int(np.count_nonzero(jumps))
     return angle - TURN * np.concatenate([[0.0], np.cumsum(jumps)]) if count else angle, count, fast
 
@@ -246,20 +247,12 @@ def turning_slope(time: np.ndarray, quaternions: np.ndarray, velocity: np.ndarra
     """
     if np.sum(np.diff(velocity, axis=0) ** 2) > np.sum(velocity[1:] ** 2):
         return None  # so few samples a swing do not tell how far it turned
-    conjugate = quaternions * np.array([1.0, -1.0, -1.0, -1.0])
-    turned = np.array([_product(a, b) for a, b in zip(conjugate[:-1], quaternions[1:])])
-    length = np.linalg.norm(turned[:, 1:], axis=1, keepdims=True)
-    angle = 2 * np.arctan2(length, turned[:, :1])
-    moved = turned[:, 1:] * np.divide(angle, length, out=np.full_like(angle, 2.0), where=length > 1e-9)
+    orientation = Rotation.from_quat(np.roll(quaternions, -1, axis=1))  # scipy has w last
+    moved = (orientation[:-1].inv() * orientation[1:]).as_rotvec()
     said = 0.5 * np.diff(time)[:, None] * (velocity[1:] + velocity[:-1])
     span = min(SPAN, len(time) // 2)
     sums = (np.cumsum(np.concatenate([np.zeros((1, 3)), x]), axis=0) for x in (moved, said))
     return _slope(*((x[span:] - x[:-span]).ravel() for x in sums))
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of two quaternions, w first."""
-    return np.concatenate([[a[0] * b[0] - a[1:] @ b[1:]], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
 
 
 def _slope(moved: np.ndarray, said: np.ndarray) -> float | None:
