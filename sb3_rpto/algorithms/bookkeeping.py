@@ -34,6 +34,7 @@ from sb3_rpto.algorithms.worlds import (
     raw_terminal,
     share_normalisation,
 )
+from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.factory import is_mujoco
 from sb3_rpto.envs.rules import task_rules
 
@@ -164,10 +165,10 @@ class TwoWorlds(PolicySnapshots):
         if self.dynamics_config is not None and is_mujoco(self.dynamics_config):
             check_machine(source, target)
 
-    def _doubt_the_target(self, error: float) -> None:
+    def _doubt_the_target(self, data: Transitions, error: float) -> None:
         """Warn, after the first fit (with the loop closed: after the first trace), where the simulator does not fit."""
         assert self.dynamics is not None
-        self._judged_rules = self._judged_rules or doubt_rules(self.dynamics, self.transitions("target"))
+        self._judged_rules = self._judged_rules or doubt_rules(self.dynamics, data)
         if self._judged_target or (self.loop is not None and not self.loop.found):
             return
         self._judged_target = True

@@ -158,7 +158,7 @@ class RelativeUpdate(SAC):
             self.logger.record(f"dynamics/{name}", value)
         error = self.dynamics.error(data)
         self.logger.record("dynamics/error", error)
-        self._doubt_the_target(error)
+        self._doubt_the_target(data, error)
 
     def fit_weights(self, data: Transitions) -> th.Tensor | None:
         """RTO's weight of each transition, (n,); None weighs all alike."""
@@ -192,7 +192,7 @@ class RelativeUpdate(SAC):
     def _rehearse(self) -> None:
         """After a fit: learn what was put off until then, where a closed loop judges what comes of it."""
 
-    def _doubt_the_target(self, error: float) -> None:
+    def _doubt_the_target(self, data: Transitions, error: float) -> None:
         """After a fit that left this one-step error: say once what speaks against the target."""
 
     def sample_batches(self, count: int, batch_size: int) -> Iterator[tuple[ReplayBufferSamples, ReplayBufferSamples]]:

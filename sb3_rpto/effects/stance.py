@@ -29,6 +29,7 @@ class Stance:
     """
 
     def __init__(self, base: Any, before: tuple[float, float] | None = None) -> None:
+        self.before = before
         self._joint = _vertical(base.model) if hasattr(base, "init_qpos") else None
         found = None if self._joint is None else _heights(base.model, self._joint, base.init_qpos)
         if found is not None and before is not None and np.allclose(base.init_qpos, base.model.qpos0):
@@ -67,7 +68,6 @@ class StandingEnv(CorrectedEnv):
     """
 
     def __init__(self, env: gym.Env, effects: Sequence[Effect], before: tuple[float, float] | None = None) -> None:
-        self._before = before
         self._stance = Stance(env.unwrapped, before)
         super().__init__(env, effects)
 
@@ -78,7 +78,7 @@ class StandingEnv(CorrectedEnv):
 
     def __getstate__(self) -> dict[str, Any]:
         """As in :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`."""
-        return {**super().__getstate__(), "before": self._before}
+        return {**super().__getstate__(), "before": self._stance.before}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         StandingEnv.__init__(self, **state)

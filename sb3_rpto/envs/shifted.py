@@ -50,7 +50,7 @@ class ShiftedEnv(StandingEnv):
         base: Any = env.unwrapped
         if not isinstance(getattr(base, "model", None), mujoco.MjModel):
             raise ValueError(f"{type(base).__name__} is neither a gymnasium MuJoCo environment nor a cart-pole")
-        self._stance, self._before = Stance(base), None
+        self._stance = Stance(base)
         CorrectedEnv.__init__(self, env, shift_effects(shift, env))
 
     def __getstate__(self) -> dict[str, Any]:

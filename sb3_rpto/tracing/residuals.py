@@ -123,7 +123,6 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
         if acting:
             world.qpos[:], world.qvel[:] = qpos[t], qvel[t]
             world.ctrl[:] = around[t]
-            world.evaluate()
             collect(world, acting)
             extra[t] = world.force[0]
             level = level + world.friction[0]
