@@ -48,8 +48,9 @@ WORTH = 0.9
 #: Source steps that fill D_source anew.
 FILL = 1_000
 #: Then the policy learns in the corrected simulator what it can for nothing, before the next target step: in rounds of
-#: so many source steps, until so many in a row earned no more than the best one, or ``retrain_steps`` are taken.
-ROUND, PATIENCE = 20_000, 2
+#: so many source steps, until so many in a row earned no more than the best one and this share of it, or
+#: ``retrain_steps`` are taken. A task that is solved earns a trifle more for ever.
+ROUND, PATIENCE, RISE = 20_000, 2, 1e-3
 #: Another simulator made D_source where the present one errs by so much on the oldest so many of its transitions.
 OTHER, OLDEST = 0.02, 500
 #: Width of a normal distribution's 95 % interval, in standard deviations.
@@ -431,7 +432,7 @@ def learn_in_source(model: Looping, rehearse: Callable[[], None]) -> None:
     rehearse()
     source = model._source_world
     assert isinstance(source, EpisodeSource)
-    best, idle, steps = -math.inf, 0, 0
+    bar, idle, steps = -math.inf, 0, 0
     while steps < model.retrain_steps and idle < PATIENCE:
         source.returns.clear()
         end = min(steps + ROUND, model.retrain_steps)
@@ -442,5 +443,5 @@ def learn_in_source(model: Looping, rehearse: Callable[[], None]) -> None:
         if model.verbose:
             print(f"learning in the corrected simulator: {steps} source steps, mean return {earned:.5g}")
         rehearse()
-        idle = 0 if earned > best else idle + 1
-        best = max(best, earned) if source.returns else best
+        idle = 0 if earned > bar else idle + 1
+        bar = earned + RISE * abs(earned) if bar < earned < math.inf else bar

@@ -603,6 +603,9 @@ class Scripted(EpisodeSource):
         ([1.0, 2.0, 1.5, 2.5, 2.0, 2.5, 9.0], 6),  # one of them alone does not end it, and as much is no gain
         ([-9.0, -8.0, -7.0, -6.0, -5.0, -4.0, -3.0, -2.0], 8),  # to the last step
         ([], 8),  # nothing to judge by
+        ([900.0, 900.2, 900.4, 999.0], 3),  # a trifle is no gain
+        ([-900.0, -899.8, -899.6, 0.0], 3),
+        ([900.0, 900.8, 901.6, 902.4, 903.2, 904.0, 904.8, 905.6], 8),  # but trifles add up
     ],
 )
 def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
