@@ -97,7 +97,7 @@ class Report:
     :param floor: of the corrected model on recordings of itself with the noise of the data; empty for exact data
     :param force_before: force residual of the declared model on test runs, N·m or N, (nv,)
     :param force_after: of the corrected model, (nv,)
-    :param learnable: share of what is left that a small regressor predicts, (nv,)
+    :param learnable: share of what is left that a small regressor predicts, (nv,); NaN where only rounding is left
     :param residuals_before: the force residuals themselves, an item for each run that is long enough
     :param residuals_after: of the corrected model
     :param findings: all that was found and repaired in the data

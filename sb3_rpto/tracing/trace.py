@@ -133,6 +133,7 @@ def trace(
     residuals_before = [] if tied else missing_forces(simulation, before.values, data)
     residuals_after = [] if tied else missing_forces(simulation, final, data)
     unknown = np.full(simulation.model.nv, np.nan)  # where all runs are too short to differentiate
+    rounding = data.exact and found.after.adequate  # is all that is left
     verdict = judge(found.before, found.after, bool(selection.model.effects))
     floor = noise_floor(simulation, final, data, sigma, seed)
     if verdict in SETTLED:
@@ -160,7 +161,7 @@ def trace(
         floor=floor,
         force_before=summary(residuals_before) if residuals_before else unknown,
         force_after=summary(residuals_after) if residuals_after else unknown,
-        learnable=learnable_share(residuals_after, seed) if residuals_after else unknown,
+        learnable=learnable_share(residuals_after, seed) if residuals_after and not rounding else unknown,
         residuals_before=residuals_before,
         residuals_after=residuals_after,
         findings=findings,

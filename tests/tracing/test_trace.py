@@ -387,12 +387,16 @@ def test_an_unchanged_environment_is_complete_without_error() -> None:
     assert report.verdict == "complete"
     assert all(np.all(e.rmse < 1e-4) for e in report.before)
     assert report.floor == []
+    assert np.all(np.isnan(report.learnable))  # of rounding
 
 
 def test_dry_friction_that_an_environment_lacks_is_found() -> None:
     env, data = driven(1.0)
     report = trace(env, data, candidates=NATIVE, threads=1)
     assert report.verdict in ("explained", "partly explained")
+    without = trace(env, data, candidates=[], threads=1)
+    assert without.verdict == "unexplained"
+    assert np.all(without.learnable >= 0)
     labels = {t.label: t for t in report.effects}
     assert "coulomb_friction(slider)" in labels
     assert labels["coulomb_friction(slider)"].effect.values[0] == pytest.approx(1.0, rel=0.1)
