@@ -8,31 +8,38 @@ import numpy as np
 from sb3_rpto.effects.effect import HOOKS, Effect, Scales
 from sb3_rpto.effects.simulation import Drive, Simulation
 
-#: Simulations at once, of different parameters, and steps of each.
-N, STEPS = 3, 4
+#: Simulations at once, of different parameters, and steps of each; the middle one begins at rest, those beside it at
+#: this speed in rad/s or m/s.
+N, STEPS, SPEED = 3, 4, 0.1
 
 
 def try_out(model: mujoco.MjModel, effect: Effect) -> None:
-    """Require that an effect's hooks work on several simulations at once.
+    """Require that an effect's hooks work on several simulations at once, at rest and in motion.
 
     :param model: that it is an effect of
     :param effect: of a class of the user's own
-    :raises ValueError: a hook raises an error; the message names the effect and its hooks
+    :raises ValueError: a hook raises an error, or what comes of it is not finite; the message names effect and hooks
     """
     sizes = np.array([p.null + p.size_for(Scales()) for p in effect.parameters])
     low, high = np.array([(p.lower, p.upper) for p in effect.parameters]).T
     values = np.clip(np.linspace(0.5, 1.0, N)[:, None] * sizes, low, high)
-    qpos, qvel = np.tile(model.qpos0, (N, 1)), np.zeros((N, model.nv))
+    qpos, qvel = np.tile(model.qpos0, (N, 1)), np.tile(np.linspace(-SPEED, SPEED, N)[:, None], model.nv)
     drive = Drive(np.zeros((N, STEPS, model.nu)), 0, None, {})
+    hooks = " or ".join(hook for hook in HOOKS if effect.overrides(hook)) + f" of {type(effect).__name__}"
     try:
         simulation = Simulation(model, [effect], 1)
-        simulation.rollout(values, qpos, qvel, drive)
-        effect.late(values)
-        q, v = np.zeros((2, N, STEPS))
-        effect.unobserve(*effect.observe(q, v, values[:, None]), values[:, None])
+        motion = simulation.rollout(values, qpos, qvel, drive)
+        sent = effect.command(np.zeros(N), values, {}, model.opt.timestep)  # MuJoCo takes one that is no number for 0
+        seen = effect.observe(np.zeros((N, STEPS)), np.zeros((N, STEPS)), values[:, None])
+        made = (*motion, sent, effect.late(values), *seen, *effect.unobserve(*seen, values[:, None]))
+        finite = all(np.isfinite(array).all() for array in made)
     except Exception as error:  # whatever somebody's code raises
-        hooks = " or ".join(hook for hook in HOOKS if effect.overrides(hook))
         raise ValueError(
-            f"{effect.label}: {hooks} of {type(effect).__name__} fails on {N} simulations at once "
+            f"{effect.label}: {hooks} fails on {N} simulations at once "
             f"({type(error).__name__}: {error}); x has one row for each simulation and one column for each parameter"
         ) from error
+    if not finite:
+        raise ValueError(
+            f"{effect.label}: what {hooks} makes of plausible parameters is not finite, at the model's zero pose, at "
+            f"rest or at speeds up to {SPEED} rad/s or m/s; mind what it divides by there"
+        )

@@ -1,6 +1,7 @@
 """Which effects a model may lack, and how a user adds another."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import gymnasium as gym
 import mujoco
@@ -222,6 +223,28 @@ def test_a_hook_that_fails_is_named_before_a_search(hook: str) -> None:
     compiled = model()
     with pytest.raises(ValueError, match=rf"wrong\(\w+\): {hook} of Wrong fails on 3 .*IndexError: too many indices"):
         try_out(compiled, own(own.places(compiled)[0]))
+
+
+def nothing_over_nothing(self: Effect, *arguments: Any) -> Any:
+    """Any hook whose equation divides by a speed or a command, at rest."""
+    if self.place == "joint":  # act(world, x)
+        world, x = arguments
+        world.force[:, self.dof] -= x[:, 0] * world.qvel[:, self.dof] / np.abs(world.qvel[:, self.dof])
+        return None
+    u = arguments[0]
+    with np.errstate(invalid="ignore"):
+        return u / u if self.place == "actuator" else (u / u, arguments[1])
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+@pytest.mark.parametrize("hook", ["act", "command", "observe"])
+def test_a_hook_that_makes_no_numbers_is_named_before_a_search(hook: str) -> None:
+    place = {"act": "joint", "command": "actuator"}.get(hook, "sensor")
+    own = {"kind": "no_number", "place": place, "parameters": (Parameter("strength", "N·m", 0.1),), "equation": ""}
+    wrong = type("Wrong", (Effect,), {**own, hook: nothing_over_nothing})
+    compiled = model()
+    with pytest.raises(ValueError, match=rf"no_number\(\w+\): what {hook} of Wrong makes .* is not finite.*at rest"):
+        try_out(compiled, wrong(wrong.places(compiled)[0]))
 
 
 def test_effects_of_the_library_pass() -> None:
