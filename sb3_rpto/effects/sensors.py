@@ -1,8 +1,10 @@
-"""What a joint's sensor shows."""
+"""What a joint's sensor shows, to whoever records it and to the servo that regulates it."""
 
+import mujoco
 import numpy as np
 
 from sb3_rpto.effects.effect import Effect, Parameter, register
+from sb3_rpto.effects.world import World
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -10,6 +12,13 @@ Pair = tuple[np.ndarray, np.ndarray]
 def _along(x: np.ndarray, q: np.ndarray) -> np.ndarray:
     """A parameter (n,) with axes added so that it spreads over (n, ...)."""
     return x.reshape(x.shape + (1,) * (q.ndim - x.ndim))
+
+
+def _readers(sensor: Effect, model: mujoco.MjModel) -> np.ndarray:
+    """The actuators that feed back the sensor's position, kp (u - q) for one, with gear g kp (u - g q)."""
+    there = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == sensor.index)
+    feedback = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (model.actuator_biasprm[:, 1] != 0)
+    return np.flatnonzero(there & feedback)
 
 
 def ago(steps: np.ndarray, q: np.ndarray, v: np.ndarray) -> Pair:
@@ -50,7 +59,8 @@ class SensorDelay(Effect):
 class SensorBias(Effect):
     """An encoder whose zero is wrong: it shows :math:`q + b`; the speed is right.
 
-    The joint offset of a robot's geometric calibration (Khalil & Dombre 2002).
+    The joint offset of a robot's geometric calibration (Khalil & Dombre 2002). A position servo on the joint regulates
+    what it shows, :math:`k_p (u - q - b)`.
     """
 
     kind = "sensor_bias"
@@ -67,12 +77,19 @@ class SensorBias(Effect):
         """Shift it back."""
         return q - _along(x[..., 0], q), v
 
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Feed back what is shown."""
+        for i in _readers(self, world.model):
+            bias = world.field("actuator_biasprm")
+            bias[:, i, 0] += bias[:, i, 1] * world.model.actuator_gear[i, 0] * x[:, 0]
+
 
 @register
 class SensorGain(Effect):
     r"""A wrong scale of an encoder or potentiometer: it shows :math:`(1 + g)\,q` and :math:`(1 + g)\,\dot q`.
 
-    The joint transducers' part of a robot's calibration (Mooring, Roth & Driels 1991).
+    The joint transducers' part of a robot's calibration (Mooring, Roth & Driels 1991). A position servo on the joint
+    regulates what it shows, :math:`k_p (u - (1 + g) q)`; feedback of the speed may be back-EMF, and stays.
     """
 
     kind = "sensor_gain"
@@ -90,3 +107,8 @@ class SensorGain(Effect):
         """Scale them back."""
         gain = 1 + _along(x[..., 0], q)
         return q / gain, v / gain
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Feed back what is shown."""
+        for i in _readers(self, world.model):
+            world.field("actuator_biasprm")[:, i, 1] *= 1 + x[:, 0]

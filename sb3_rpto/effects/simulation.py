@@ -213,8 +213,13 @@ def quiet() -> Iterator[None]:
 
 
 def prepare(world: World, active: Active) -> None:
-    """Write what the effects change of the model: numbers, known or declared, first, additions after."""
-    for effect, x in sorted(active, key=lambda pair: pair[0].rank if isinstance(pair[0], Declared) else math.inf):
+    """Write what the effects change of the model: numbers, known or declared, first, additions after.
+
+    What a sensor does last is written first: a servo's gain on the joint's position is then one on what comes before.
+    """
+    ordered = sorted(active, key=lambda pair: pair[0].rank if isinstance(pair[0], Declared) else math.inf)
+    sensing = [pair for pair in ordered if pair[0].senses]
+    for effect, x in [*(pair for pair in ordered if not pair[0].senses), *reversed(sensing)]:
         effect.write(world, x)
     world.settle()
 

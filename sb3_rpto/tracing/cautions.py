@@ -153,9 +153,10 @@ def early_response(found: Found, data: Measurements) -> list[Finding]:
 
 
 def encoder_zeros(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Finding]:
-    """Constant torques that may be a wrong encoder zero: a position servo regulates what its encoder shows.
+    """Constant torques that may be a zero of the recording's own: a position servo regulates its encoder.
 
-    An encoder that shows q + b makes it pull by -g² kp b, with g the gear, which effects of sensors leave out.
+    Effects of sensors are the encoder's. Where something else measured the joint, with a zero that is off by b, the
+    servo seems to pull by g² kp b, with g the gear.
     """
     found = []
     for effect in named:
@@ -166,9 +167,10 @@ def encoder_zeros(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Findin
             continue
         stiffness = sum(model.actuator_gear[i, 0] ** 2 * model.actuator_gainprm[i, 0] for i in servos)
         message = (
-            "a position servo acts there: an encoder whose zero is off makes it pull like this, too, by an error of "
-            f"{-float(effect.values[0]) / stiffness:.3g} {'m' if model.jnt_type[joint] == SLIDE else 'rad'}, with "
-            "nothing wrong with the torque; check the zero"
+            "a position servo acts there: where the recorded position is not of the servo's own encoder, two zeros "
+            f"that differ by {float(effect.values[0]) / stiffness:.3g} "
+            f"{'m' if model.jnt_type[joint] == SLIDE else 'rad'} look like this, too, with nothing wrong with the "
+            "torque; check the zeros"
         )
         found.append(Finding("encoder zero", effect.label, message))
     return found

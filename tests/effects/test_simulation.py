@@ -256,6 +256,36 @@ def test_what_several_sensor_effects_make_of_one_joint_is_undone_in_whatever_ord
     np.testing.assert_allclose(speed, v, atol=1e-12)
 
 
+HELD = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body>
+<joint name="elbow" axis="0 1 0" damping="0.3"/><geom size="0.02" fromto="0 0 0 0.3 0 0" type="capsule"/>
+</body></worldbody>
+<actuator>{}</actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("kinds", list(permutations(["sensor_bias", "sensor_gain"])), ids=" ".join)
+def test_a_servo_regulates_what_its_encoder_shows(kinds: tuple) -> None:
+    given = {"sensor_bias": 0.3, "sensor_gain": 0.2}
+    model = mujoco.MjModel.from_xml_string(HELD.format('<position joint="elbow" kp="4" kv="0.2" gear="0.5"/>'))
+    sim = Simulation(model, [LIBRARY[kind]("elbow") for kind in kinds], 1)
+    values = np.array([[given[kind] for kind in kinds], [0.0, 0.0]])
+    shown = sim.rollout(values, np.zeros((2, 1)), np.zeros((2, 1)), Drive(np.full((2, 5000, 1), 0.35)))[0][:, -1]
+    assert shown[1] == pytest.approx(0.7)  # the joint itself, half a turn of which is one of the motor
+    for effect, x in sim.sensing(values):
+        shown = effect.observe(shown, shown, x)[0]
+    np.testing.assert_allclose(shown, 0.7, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "actuator", ['<motor joint="elbow"/>', '<velocity joint="elbow" kv="3"/>', '<general joint="elbow" gainprm="3"/>']
+)
+def test_other_actuators_read_no_encoder(actuator: str) -> None:
+    model = mujoco.MjModel.from_xml_string(HELD.format(actuator))
+    sim = Simulation(model, [LIBRARY["sensor_bias"]("elbow"), LIBRARY["sensor_gain"]("elbow")], 1)
+    qpos, drive = np.full((2, 1), 0.4), Drive(np.full((2, 50, 1), 0.1))
+    wrong, right = sim.rollout(np.array([[0.3, 0.2], [0.0, 0.0]]), qpos, np.zeros((2, 1)), drive)[0]
+    np.testing.assert_array_equal(wrong, right)
+
+
 def test_a_place_that_is_not_there_is_named() -> None:
     with pytest.raises(ValueError, match="the model has no joint 'ellbow'; did you mean 'elbow'"):
         Simulation(MODEL, [LIBRARY["viscous_friction"]("ellbow")])

@@ -35,10 +35,10 @@ def named(actuator: str, torque: float = -3.75) -> list[str]:
     return [f.message for f in encoder_zeros(model, effects)]
 
 
-def test_a_constant_torque_where_a_servo_holds_may_be_the_encoders_zero() -> None:
+def test_a_constant_torque_where_a_servo_holds_may_be_a_zero_of_the_recordings_own() -> None:
     (message,) = named('<position joint="elbow" kp="30"/>')
-    assert "by an error of 0.125 rad" in message
+    assert "two zeros that differ by -0.125 rad" in message
     (geared,) = named('<position joint="elbow" kp="30" gear="0.5"/>')
-    assert "by an error of 0.5 rad" in geared
+    assert "two zeros that differ by -0.5 rad" in geared
     for other in ('<motor joint="elbow"/>', '<velocity joint="elbow" kv="3"/>'):
         assert named(other) == []
