@@ -61,7 +61,13 @@ class Corrected:
 
         :param env: a gymnasium MuJoCo environment; it is changed. :func:`sb3_rpto.envs.corrected.apply_effects` with
             :attr:`effects` leaves it alone
+        :raises TypeError: ``env`` is none
         """
+        if not isinstance(env, gym.Env):
+            raise TypeError(
+                f"env must be a gymnasium MuJoCo environment, not {type(env).__name__}; without one, "
+                "simulation().rollout(...) simulates the corrected model"
+            )
         effects, given = self.effects, env.unwrapped.model  # type: ignore[attr-defined]
         if same_layout(given, self.model) and not differing(given, self.model, rounded=True):
             return StandingEnv(env, [e for e in effects if carried_by(e) == "wrapper"], self.heights)

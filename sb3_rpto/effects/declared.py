@@ -18,6 +18,8 @@ from sb3_rpto.effects.world import World
 OBJECTS = ("joint", "body", "geom", "actuator")
 #: Dry friction in N·m or N that is left of a model's own.
 LEAST_FRICTION = 1e-12
+#: So many plausible sizes above its nominal value, what holds a joint still would do so by several times its torque.
+REACH = 100.0
 
 
 class _Kind(NamedTuple):
@@ -28,6 +30,7 @@ class _Kind(NamedTuple):
     write: Callable[[World, int, np.ndarray, float], None]  # world, id, values (n,), nominal
     size: Callable[[Scales], float]  # scale of a fit where the nominal value is zero
     span: tuple[float, float] | None = None  # default bounds as multiples of the nominal value; None: [0, inf)
+    holds: bool = False  # whether a joint stands still where it is large
 
 
 _Read = Callable[[mujoco.MjModel, int], float]
@@ -165,10 +168,10 @@ def _viscous_size(scales: Scales) -> float:
 _POSITIVE = (0.1, 10.0)
 _KINDS: dict[str, dict[str, _Kind]] = {
     "joint": {
-        "damping": _Kind("N·m·s/rad", *_dof("dof_damping"), _viscous_size),
-        "frictionloss": _Kind("N·m", *_dof("dof_frictionloss"), _friction_size),
+        "damping": _Kind("N·m·s/rad", *_dof("dof_damping"), _viscous_size, holds=True),
+        "frictionloss": _Kind("N·m", *_dof("dof_frictionloss"), _friction_size, holds=True),
         "armature": _Kind("kg·m²", *_dof("dof_armature"), lambda s: 0.05 * s.inertia),
-        "stiffness": _Kind("N·m/rad", *_column("jnt_stiffness"), lambda s: 0.05 * s.torque / s.span),
+        "stiffness": _Kind("N·m/rad", *_column("jnt_stiffness"), lambda s: 0.05 * s.torque / s.span, holds=True),
         "range": _Kind("rad", _range, _write_range, lambda s: s.span, _POSITIVE),
     },
     "body": {
@@ -229,7 +232,8 @@ class Declared(Effect):
     :param model: the model that has it
     :param name: ``<object>.<parameter>``, with ``joint:`` (``body:``, ``geom:``, ``actuator:``) before the object
         where two objects share a name, and ``option`` as the object of ``gravity``, ``viscosity`` and ``density``
-    :param bounds: smallest and largest value; default: from 0, or a tenth to ten times the nominal value
+    :param bounds: smallest and largest value; default: from 0 (to :meth:`ceiling` in a trace), or a tenth to ten times
+        the nominal value
     :param nominal: its nominal value where ``model`` has been corrected since; default: that of ``model``
     :raises ValueError: no such object or parameter, an actuator that is not the servo which has it, a nominal value of
         zero where only factors make sense, bounds that do not hold the nominal value
@@ -257,6 +261,8 @@ class Declared(Effect):
         if how.span is not None and nominal == 0:
             raise ValueError(f"{name} is 0 in the model, so it cannot be scaled; give it a value in the MJCF")
         lower, upper = bounds or ((0.0, np.inf) if how.span is None else tuple(sorted(nominal * s for s in how.span)))
+        if lower > upper:
+            raise ValueError(f"{name}: the bounds [{lower:g}, {upper:g}] are the wrong way round; give low:high")
         if not lower <= nominal <= upper or lower == upper:
             raise ValueError(f"{name}: the bounds [{lower:g}, {upper:g}] do not hold the nominal value {nominal:g}")
         self._take(name, nominal, lower, upper)
@@ -312,7 +318,22 @@ class Declared(Effect):
         return clone
 
     def bind(self, model: mujoco.MjModel) -> None:
-        """Nothing: the name was looked up when it was declared."""
+        """Look up ``self.dof`` of a joint; the name was looked up when it was declared."""
+        if self.owner == "joint":
+            self.dof = int(model.jnt_dofadr[self.index])
+
+    def ceiling(self, scales: Scales) -> float:
+        """The largest value in a trace: without bounds, a joint's damping, friction and stiffness have one there.
+
+        It is ten times the nominal value, or what would hold the joint still against several times its torque. A fit
+        to what something undeclared moves could freeze the joint, and with it all that might tell what that is.
+
+        :param scales: of the joint
+        """
+        (parameter,) = self.parameters
+        if not self._how.holds:
+            return parameter.upper
+        return min(parameter.upper, self.nominal + REACH * max(0.1 * self.nominal, self._how.size(scales)))
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Write the parameter's field."""

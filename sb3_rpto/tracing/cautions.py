@@ -14,12 +14,13 @@ from sb3_rpto.effects.units import joint_of
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE
 from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor
+from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor, predictions
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.prepare import SetUp
 from sb3_rpto.tracing.search import Found
 from sb3_rpto.tracing.select import Selector
+from sb3_rpto.tracing.windows import cut
 
 JOINT, SLIDE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtJoint.mjJNT_SLIDE)
 #: Test runs that err by so many times their noise are told; over all of them together none of the benchmark's 187
@@ -32,6 +33,8 @@ APART = 3.0
 VAGUE = 0.9
 #: Commands one sample earlier that leave less than this share of the error were logged after they had acted.
 EARLY = 0.5
+#: Most windows that steps in time are compared in.
+STEPPED = 40
 
 
 def missed(
@@ -150,6 +153,54 @@ def early_response(found: Found, data: Measurements) -> list[Finding]:
         "each row seems to hold the command of the row before; shift the ctrl columns up a row and trace again"
     )
     return [Finding("early response", "all episodes, ctrl", message)]
+
+
+def own_steps(
+    nominal: mujoco.MjModel,
+    simulation: Simulation,
+    values: np.ndarray,
+    data: Measurements,
+    sigma: np.ndarray,
+    horizon: float,
+) -> list[Finding]:
+    """Where the corrected simulator errs by its own steps in time more than the sensors do.
+
+    :param nominal: the model as it was given, which integrates as the saved one will
+    :param simulation: integrates finely, as a machine does
+    :param values: parameters, (p,)
+    :param horizon: length of the predictions in s
+    """
+    if data.exact or data.simulated:
+        return []
+    predicted = []
+    for one in (simulation, Simulation(nominal, simulation.effects, simulation.nthread)):
+        windows = cut(one.model, data, sigma, horizon, STEPPED)
+        predicted.append(predictions(one, values, windows)[0])
+    apart = np.sqrt(np.mean((predicted[1] - predicted[0]) ** 2, axis=(0, 1)))
+    worst = int(np.argmax(apart / sigma))
+    if apart[worst] <= sigma[worst]:
+        return []
+    integrator = mujoco.mjtIntegrator(nominal.opt.integrator).name.removeprefix("mjINT_")
+    message = (
+        f"with its own ({integrator}, {nominal.opt.timestep:g} s) the corrected simulator goes {apart[worst]:.2g} "
+        f"astray in {horizon:g} s at {data.columns.qpos[worst]}, where the noise is {sigma[worst]:.2g}; the errors "
+        'after are of finer ones: integrator="RK4" or a shorter timestep in the MJCF\'s <option> keeps them'
+    )
+    return [Finding("own steps", "corrected simulator", message)]
+
+
+def no_nearer(before: Sequence[HorizonError], after: Sequence[HorizonError]) -> list[Finding]:
+    """Effects that do not explain, and with which runs that nothing was fitted to are predicted worse."""
+    pairs = [(b, a) for b, a in zip(before, after) if isinstance(b.horizon, float)]
+    if not pairs or np.mean([np.log(a.rmse / b.rmse).mean() for b, a in pairs]) <= 0:
+        return []
+    b, a = pairs[-1]
+    worst = int(np.argmax(a.rmse / b.rmse))
+    message = (
+        f"predicted worse with what is listed ({b.joints[worst]}, {b.horizon:g} s: {b.rmse[worst]:.3g} before, "
+        f"{a.rmse[worst]:.3g} after): it stands in for something else; do not use the corrected simulator"
+    )
+    return [Finding("no nearer", "test runs", message)]
 
 
 def encoder_zeros(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Finding]:

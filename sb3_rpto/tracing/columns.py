@@ -136,5 +136,6 @@ def _near(name: str) -> str:
     choices = [*PLAIN, *PREFIXES]
     near = difflib.get_close_matches(prefix, choices, n=2, cutoff=0.5)
     if near:
-        return "did you mean " + " or ".join(repr(c + (dot + rest if c in PREFIXES else "")) for c in near) + "?"
+        named = [c + (dot + rest if rest else ".<name>") if c in PREFIXES else c for c in near]
+        return "did you mean " + " or ".join(map(repr, named)) + "?"
     return f"columns are {', '.join(PLAIN)} and those that begin with {', '.join(p + '.' for p in PREFIXES)}"

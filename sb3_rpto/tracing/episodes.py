@@ -69,6 +69,14 @@ class Episode:
         return len(self.time)
 
 
+def _is_number(value: object) -> bool:
+    try:
+        float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
 def runs_of(file: str, table: Table) -> dict[str | None, dict[str, np.ndarray]]:
     """Check the values of a table and part its rows by episode."""
     lengths = {name: np.shape(values) for name, values in table.items()}
@@ -93,8 +101,11 @@ def runs_of(file: str, table: Table) -> dict[str | None, dict[str, np.ndarray]]:
         try:
             rows[name] = np.asarray(values).astype(np.float64)
         except (TypeError, ValueError):
+            row, odd = next((i, value) for i, value in enumerate(np.asarray(values)) if not _is_number(value))
+            remedy = "give seconds since the start of the run" if name == "time" else "correct or remove it"
             raise ValueError(
-                f"{file}: column {name!r} holds something that is not a number; correct or remove it"
+                f"{file}: column {name!r} holds {odd!r}, which is no number, in row {row} (counted from 0 below the "
+                f"header); {remedy}"
             ) from None
         bad = np.flatnonzero(~np.isfinite(rows[name]))
         if len(bad):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_rpto.effects import Scales, Simulation
+from sb3_rpto.effects import Declared, Scales, Simulation
 from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.interpolation import interpolate
 from sb3_rpto.tracing.starts import moved, straight
@@ -113,7 +113,13 @@ class Problem:
         parameters = [(p, s) for e, s in zip(simulation.effects, scales) for p in e.parameters]
         self.size = np.array([p.size_for(s) for p, s in parameters])
         self.lower = np.array([p.lower for p, _ in parameters])
-        self.upper = np.array([p.upper for p, _ in parameters])
+        self.upper = np.array(
+            [
+                e.ceiling(s) if isinstance(e, Declared) else p.upper
+                for e, s in zip(simulation.effects, scales)
+                for p in e.parameters
+            ]
+        )
         self.null = simulation.null
         self.known = np.array([e.known for e in simulation.effects for _ in e.parameters], dtype=bool)
         self.moving = np.flatnonzero((windows.spread > 0).any(axis=0))  # coordinates of the start that are free

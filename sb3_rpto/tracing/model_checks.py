@@ -140,7 +140,7 @@ def soft_ties(model: mujoco.MjModel) -> list[Finding]:
         message = (
             f"the constraint gives way over some {1e3 * model.eq_solref[tie, 0]:g} ms (its solref); where the "
             f'machine\'s is rigid, set solref="{max(0.002, 2 * model.opt.timestep):g} 1" '
-            'solimp="0.99 0.999 0.0001" in the model'
+            'solimp="0.99 0.999 0.0001" in the model, or a sensor_bias may be named that makes up for it'
         )
         found.append(Finding("soft tie", f"equality {model.equality(tie).name or tie}", message))
     return found

@@ -191,14 +191,18 @@ def prepare(
 
 
 def at_rest(data: Measurements) -> list[str]:
-    """Measured positions that never change, by their columns' names; none where all rest, or states are known whole.
+    """Measured positions that never change, by their columns' names; none where states are known whole.
 
     :param data: to fit to
+    :raises ValueError: none of them changes
     """
     moves = np.ptp(np.concatenate([e.qpos for e in data.episodes]), axis=0) > 0
     seen = [name not in data.unobserved for name in data.columns.qpos]
-    if data.whole_states or not moves[seen].any():
+    if data.whole_states:
         return []
+    if any(seen) and not moves[seen].any():
+        names = ", ".join(f"'qpos.{name}'" for name, one in zip(data.columns.qpos, seen) if one)
+        raise ValueError(f"no position changes in the runs to fit to ({names}): a dead sensor, or nothing moved")
     return [name for name, one, moved in zip(data.columns.qpos, seen, moves) if one and not moved]
 
 

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from scipy.signal import butter, filtfilt
 
-from sb3_rpto.effects import Effect, Scales, Simulation
+from sb3_rpto.effects import Declared, Effect, Scales, Simulation
 from sb3_rpto.effects.simulation import Switch, collect, filter_commands, names_of, prepare, pushing, settled
 from sb3_rpto.effects.world import BatchWorld, LiveWorld
 from sb3_rpto.tracing.checks import MIN_ROWS
@@ -178,7 +178,7 @@ class Typical:
         total = float(self.mass.sum())
         names = ("torque", "velocity", "command", "inertia", "span")
         rest = Scales(**{n: float(getattr(self, n).max(initial=1e-9)) for n in names}, mass=total)
-        if effect.place in ("joint", "sensor"):
+        if effect.place in ("joint", "sensor") or (isinstance(effect, Declared) and effect.owner == "joint"):
             at = {n: float(getattr(self, n)[effect.dof]) for n in ("torque", "velocity", "inertia", "span")}
             return replace(rest, **at)
         if effect.place == "actuator":

@@ -20,6 +20,8 @@ from sb3_rpto.tracing.cautions import (
     early_response,
     encoder_zeros,
     missed,
+    no_nearer,
+    own_steps,
     strays,
     undetermined,
 )
@@ -99,6 +101,9 @@ def trace(
     if again is not None:
         set_up, found = searched(True)
         set_up.findings.append(again)
+    no_better = not found.after.ratio < found.before.ratio
+    if no_better and judge(found.before, found.after, bool(found.selection.model.effects)) == "unexplained":
+        found = replace(found, selection=Selection(found.base), after=found.before)  # it is no hint either
     sigma, fitted = set_up.sigma, set_up.fitted
     selector, selection = found.on.fine, found.selection
     simulation, findings = selector.simulation, set_up.findings
@@ -123,6 +128,7 @@ def trace(
 
     say(0.9, "predicting the test runs")
     data = set_up.test if set_up.test.episodes else fitted
+    errors_before = horizon_errors(simulation, before.values, data, sigma, seed)
     errors_after = horizon_errors(simulation, final, data, sigma, seed)
     if not errors_after:
         length = 1e3 * max((float(np.ptp(e.time)) for e in data.episodes), default=0.0)
@@ -139,16 +145,22 @@ def trace(
     if verdict in SETTLED:
         findings += missed(simulation, final, set_up.test, sigma, seed)
         findings += above_noise(errors_after, floor, found.after.ratio) if set_up.test.episodes else []
+        findings += own_steps(set_up.nominal, simulation, final, fitted, sigma, selector.horizon)
     else:
         findings += doubts(set_up.nominal, fitted) + early_response(found, fitted)
+        findings += no_nearer(errors_before, errors_after)
     findings += undetermined(problem, final, intervals) + at_bounds(problem, final)
     findings += strays(selector, final, set_up, seed)
     kept = _kept(selection, simulation, final, intervals, selector.limit(selection.model), seed)
     findings += encoder_zeros(simulation.model, [traced.effect for traced in kept])
-    unstable = problem.unstable(final)
-    if unstable:
-        message = f"in {unstable} of {len(problem.windows)} the corrected model became unstable; lower its timestep"
-        findings.append(Finding("unstable", "fitted windows", message))
+    for which, values, remedy in (
+        ("fitted declared", before.values, "its errors before say no more; give bounds to what you declare"),
+        ("corrected", final, "lower its timestep"),
+    ):
+        unstable = problem.unstable(values)
+        if unstable:
+            message = f"in {unstable} of {len(problem.windows)} the {which} model became unstable; {remedy}"
+            findings.append(Finding("unstable", "fitted windows", message))
     return Report(
         verdict=verdict,
         declared=_declared(simulation, final, intervals),
@@ -156,7 +168,7 @@ def trace(
         candidates=_fates(simulation, found.screening, selection),
         adequacy_before=found.before,
         adequacy_after=found.after,
-        before=horizon_errors(simulation, before.values, data, sigma, seed),
+        before=errors_before,
         after=errors_after,
         floor=floor,
         force_before=summary(residuals_before) if residuals_before else unknown,

@@ -139,7 +139,7 @@ def planted(value, row=7, column="qpos.hinge"):
         (edited(split=np.repeat(["train", "test"], 100)), r"'split' changes within the episode"),
         (edited(split=np.repeat(["valid"], 200)), r"'split' holds 'valid'; use one of train, select, test"),
         (edited(episode=np.repeat([0, np.nan], 100)), r"'episode' is empty in row 100"),
-        (edited(ctrl__motor=np.repeat(["on"], 200)), r"'ctrl.motor' holds something that is not a number"),
+        (edited(ctrl__motor=np.repeat(["on"], 200)), r"'ctrl.motor' holds .*'on'.*no number, in row 0.*correct"),
         (edited(ctrl__motor=np.zeros(3)), r"one shape"),
         (planted(np.nan), r"a: column 'qpos.hinge' has 1 NaN or infinite value\(s\), first in row 7"),
         (planted(np.inf, column="ctrl.motor"), r"'ctrl.motor' has 1 NaN or infinite"),
