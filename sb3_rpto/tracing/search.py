@@ -83,7 +83,7 @@ def find(
         return Found(on, base, before, None, Selection(base), before)
     on = aligned(on, base.fit.values)
     on.say(0.15, "screening the candidates")
-    screening = screen(on.fine.train, base.fit)
+    screening = screen(on.fine.train, within_bounds(on.fine.train, base.fit))
     if calibrate:
         on.say(0.2, f"calibrating on {calibrate} complete sets")
         t = calibrated(on.rough, on.rough.model((), base.fit).fit, worth_fitting(on.fine, screening), calibrate, seed)
@@ -103,6 +103,12 @@ def find(
         on, base = then, then.fine.model((), base.fit, iterations=10)
         before = judged(on.fine, base, seed)
     return Found(on, base, before, screening, selection, after)
+
+
+def within_bounds(problem: Problem, fit: Fit) -> Fit:
+    """The fit with nominal values for what ends at an upper bound: a joint that is held still excites nothing."""
+    held = problem.known & (fit.values >= problem.upper)
+    return problem.score(np.where(held, problem.null, fit.values)) if held.any() else fit
 
 
 def closely(

@@ -486,3 +486,16 @@ def test_effects_that_the_loaded_model_has_already_are_not_put_in_twice(tmp_path
         corrected.reset(seed=0)
         trajectories.append([corrected.step(np.array([0.3]))[0] for _ in range(5)])
     np.testing.assert_allclose(*trajectories, rtol=1e-4, atol=1e-6)
+
+
+def test_without_an_environment_a_correction_is_simulated(tmp_path) -> None:
+    save_corrected(tmp_path, ARM % ("", ""), [StribeckFriction("elbow", extra=0.1, level=0.2, speed=0.3)])
+    corrected = load_corrected(tmp_path)
+    with pytest.raises(TypeError, match=r"not str; without one, simulation\(\)\.rollout"):
+        corrected.apply("arm.xml")  # type: ignore[arg-type]
+    simulation = corrected.simulation(1)
+    start = np.full((1, 2), 0.3), np.full((1, 2), 0.5)
+    drive = Drive(np.zeros((1, 100, corrected.model.nu)))
+    slowed = simulation.rollout(simulation.values()[None], *start, drive)[1][0, -1, 1]
+    free = simulation.rollout(simulation.null[None], *start, drive)[1][0, -1, 1]
+    assert abs(slowed) < abs(free)

@@ -70,6 +70,19 @@ def test_default_bounds() -> None:
     assert damping.with_values(np.array([-3.0])).values == [0.0]
 
 
+def test_what_holds_a_joint_still_has_a_ceiling_in_a_trace() -> None:
+    scales = Scales(torque=3.0, velocity=2.0, inertia=0.1, span=0.5)
+    names = ("hinge.damping", "hinge.frictionloss", "hinge.stiffness", "hinge.armature", "hinge.damping=0:0.7")
+    found = [one.ceiling(scales) for name in names for one in declare(MODEL, [name])]
+    nominal = [one.nominal for name in names[:3] for one in declare(MODEL, [name])]
+    # at the typical speed (moving at all, at the end of the range) five times the typical torque and the model's own
+    held = np.array([5 * 3.0 / 2.0, 5 * 3.0, 5 * 3.0 / 0.5]) + nominal
+    np.testing.assert_allclose(found[:3], np.maximum(held, 11 * np.array(nominal)))
+    assert found[3:] == [np.inf, 0.7]
+    (strong,) = declare(MODEL, ["hinge.damping"])
+    assert strong.ceiling(Scales(torque=1e-6)) == pytest.approx(11 * strong.nominal)
+
+
 @pytest.mark.parametrize(
     ("name", "least"),
     [("arm.mass=-1:3", "above 0"), ("arm.mass=0:30", "above 0"), ("hinge.damping=-1:2", "at least 0")],
@@ -94,6 +107,7 @@ def test_given_bounds() -> None:
         ("hinge.damping=0.1", "write bounds as <name>=<lower>:<upper>"),
         ("hinge.damping=a:b", "write bounds as <name>=<lower>:<upper>"),
         ("hinge.damping=0.3:0.9", r"\[0.3, 0.9\] do not hold the nominal value 0.2"),
+        ("hinge.damping=0.9:0.1", r"\[0.9, 0.1\] are the wrong way round; give low:high"),
     ):
         with pytest.raises(ValueError, match=said):
             declare(MODEL, [wrong])

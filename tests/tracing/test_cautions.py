@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.effects.forces import Spring, TorqueOffset
-from sb3_rpto.tracing.cautions import above_noise, encoder_zeros
+from sb3_rpto.tracing.cautions import above_noise, encoder_zeros, no_nearer
 from sb3_rpto.tracing.evaluate import HorizonError
 
 SERVO = """<mujoco><worldbody><body><joint name="elbow" axis="0 1 0"/><geom size="0.1"/></body></worldbody>
@@ -25,6 +25,14 @@ def test_a_model_that_few_windows_pass_is_told_where_the_test_runs_deny_it(
     after = replace(ERROR, low=np.array([low, 0.9e-3]))
     found = above_noise([after, replace(after, horizon="whole run")], [FLOOR], ratio)
     assert [f.kind for f in found] == ["few windows"] * told
+
+
+def test_what_explains_nothing_and_predicts_worse_is_told() -> None:
+    worse = replace(ERROR, rmse=np.array([1.4e-3, 3e-3]))
+    whole = replace(ERROR, horizon="whole run", rmse=np.array([1e-9, 1e-9]))  # of a few runs: chance
+    (found,) = no_nearer([ERROR, replace(ERROR, horizon="whole run")], [worse, whole])
+    assert "worse with what is listed (b, 0.5 s: 0.001 before, 0.003 after)" in found.message
+    assert no_nearer([worse], [ERROR]) == no_nearer([whole], [worse]) == no_nearer([], []) == []
 
 
 def named(actuator: str, torque: float = -3.75) -> list[str]:

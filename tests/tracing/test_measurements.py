@@ -128,6 +128,8 @@ def planted(value, row=7, column="qpos.hinge"):
     ("table", "message"),
     [
         (edited(qpso__hinge=np.zeros(200)), r"a: unknown column 'qpso.hinge'; did you mean 'qpos.hinge'"),
+        (edited(axle_pos=np.zeros(200)), r"unknown column 'axle_pos'; did you mean 'qpos.<name>'"),
+        (edited(time=np.repeat(["2026-01-01 10:00"], 200)), r"'time' holds .*10:00.* in row 0 .*; give seconds since"),
         (edited(zzz=np.zeros(200)), r"unknown column 'zzz'; columns are"),
         ({"": np.arange(200), **swing()}, r"unknown column ''; an index .*index=False"),
         (edited(time=None), r"no column 'time'"),
