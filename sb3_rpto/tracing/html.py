@@ -162,7 +162,7 @@ def _evidence(report: Report, t: Traced) -> str:
     )
     alike = f"the data cannot tell it from {', '.join(t.alike)}" if t.alike else "no other candidate does as well"
     items = (
-        ("Class", alike),
+        ("Class", "; ".join([alike, *map(str, t.stand_ins)])),
         (
             "Evidence",
             f"saves {wording.percent(t.gain)} of the window error, t = {wording.number(t.t, 3)} where "

@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from sb3_rpto.tracing.evidence import GAIN
-from sb3_rpto.tracing.identify import Fit
+from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.select import REFIT, SEEMS, Model, Selection, Selector
 
@@ -123,6 +123,12 @@ class Likes:
                     selection.alike[other] = sorted({*selection.alike.pop(e, []), e} - {other})
                     break
         return model
+
+    def instead(self, model: Model, old: int, new: int, problem: Problem) -> Fit:
+        """Fit ``new`` in the place of ``old`` to other windows, all else of the model with it."""
+        values, simulation = self._translated(model, old, new).values, self.selector.simulation
+        values[simulation.slices[old]] = simulation.null[simulation.slices[old]]
+        return problem.fit(values, self.selector.free([*(i for i in model.effects if i != old), new]))
 
     def _kind_everywhere(self, model: Model) -> Model:
         """Try each kind in the place of all others that it resembles, at once: one alone may look no better.

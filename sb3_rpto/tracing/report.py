@@ -30,6 +30,26 @@ FORMAT = 1
 
 
 @dataclass(frozen=True)
+class StandIn:
+    """An effect of the class of one that was named, as it would be in its place.
+
+    :param effect: with the values that it would have
+    :param units: of its parameters
+    :param others: parameters of declared numbers and other named effects that lie outside their intervals then
+    """
+
+    effect: Effect
+    units: tuple[str, ...]
+    others: dict[str, float]
+
+    def __str__(self) -> str:
+        own = zip(self.effect.parameters, self.effect.values, self.units)
+        said = ", ".join(f"{p.name} {wording.number(value)} {unit}".rstrip() for p, value, unit in own)
+        then = ", ".join(f"{name} {wording.number(value)}" for name, value in self.others.items())
+        return f"{self.effect.label} instead: {said}{f', and then {then}' if then else ''}"
+
+
+@dataclass(frozen=True)
 class Traced:
     """An effect with its fitted parameters.
 
@@ -40,6 +60,7 @@ class Traced:
     :param gain: share of the typical window error that it saves
     :param t: of that gain
     :param frequency: share of resampled sets of blocks in which that evidence is clear
+    :param stand_ins: those of ``alike`` that do as well in the final fit, where all else is explained
     """
 
     effect: Effect
@@ -49,6 +70,7 @@ class Traced:
     gain: float
     t: float
     frequency: float
+    stand_ins: list[StandIn] = field(default_factory=list)
 
     @property
     def label(self) -> str:
@@ -202,6 +224,7 @@ class Report:
             )
             if t.alike:
                 lines.append(f"    the data cannot tell it from {', '.join(t.alike)}")
+            lines += [f"      {one}" for one in t.stand_ins]
         return lines
 
     def _errors(self) -> list[list[str]]:
@@ -266,6 +289,10 @@ class Report:
                 },
                 "equation": t.effect.equation,
                 "alike": t.alike,
+                "instead": [
+                    {"label": one.effect.label, "parameters": one.effect.to_json()["values"], "others": one.others}
+                    for one in t.stand_ins
+                ],
                 **evidence,
                 "carried_by": carried_by(t.effect),
             }

@@ -29,12 +29,13 @@ from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.concentrate import NOTHING
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Loss, Problem
+from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.missing import missing_forces
 from sb3_rpto.tracing.model_checks import doubts
 from sb3_rpto.tracing.origin import origin
 from sb3_rpto.tracing.prepare import Progress, SetUp, prepare
-from sb3_rpto.tracing.report import Candidate, Report, Traced
+from sb3_rpto.tracing.report import Candidate, Report, StandIn, Traced
 from sb3_rpto.tracing.residuals import learnable_share, summary
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.search import Found, find
@@ -44,6 +45,8 @@ from sb3_rpto.tracing.windows import Windows
 #: Verdicts that leave nothing to look for.
 SETTLED = ("complete", "explained")
 _NEVER = "beside what is kept it lowers the error of unseen windows by nothing clear"
+#: Another effect's typical error that is still as good, as a multiple.
+AS_WELL = 1.1
 #: Most iterations of the last fits: where two parameters do nearly the same, a descent goes slowly along their valley.
 FINAL = 40
 
@@ -152,6 +155,9 @@ def trace(
     findings += undetermined(problem, final, intervals) + at_bounds(problem, final)
     findings += strays(selector, final, set_up, seed)
     kept = _kept(selection, simulation, final, intervals, selector.limit(selection.model), seed)
+    if verdict in SETTLED and found.screening is not None:
+        likes = Likes(selector, found.screening)
+        kept = [replace(t, stand_ins=_stand_ins(t, selection, likes, problem, final, intervals)) for t in kept]
     findings += encoder_zeros(simulation.model, [traced.effect for traced in kept])
     for which, values, remedy in (
         ("fitted declared", before.values, "its errors before say no more; give bounds to what you declare"),
@@ -359,6 +365,30 @@ def _kept(
         frequency = evidence.frequency(limit, rng)
         units = units_at(effect, simulation.model)
         found.append(Traced(effect, units, intervals[:, s], alike, evidence.gain, evidence.t, frequency))
+    return found
+
+
+def _stand_ins(
+    traced: Traced, selection: Selection, likes: Likes, problem: Problem, values: np.ndarray, intervals: np.ndarray
+) -> list[StandIn]:
+    """Those of an effect's class that meet the same windows as well, and what else changes with them."""
+    simulation = problem.simulation
+    (kept,) = (i for i in selection.model.effects if simulation.effects[i].label == traced.label)
+    typical = float(np.median(problem.score(values).errors))
+    free = {i for i, e in enumerate(simulation.effects) if e.known or i in selection.model.effects} - {kept}
+    found = []
+    for other in selection.alike.get(kept, []):
+        fit = likes.instead(selection.model, kept, other, problem)
+        if np.median(fit.errors) > AS_WELL * typical:  # led astray, or too many parameters for one place
+            continue
+        moved = {}
+        for i in sorted(free):
+            effect, s = simulation.effects[i], simulation.slices[i]
+            for p, value, (low, high) in zip(effect.parameters, fit.values[s], intervals[:, s].T):
+                if value < low or value > high:
+                    moved[effect.label if isinstance(effect, Declared) else f"{effect.label} {p.name}"] = float(value)
+        there = simulation.effects[other].with_values(fit.values[simulation.slices[other]])
+        found.append(StandIn(there, units_at(there, simulation.model), moved))
     return found
 
 

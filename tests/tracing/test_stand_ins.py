@@ -1,0 +1,51 @@
+"""A falling ball: without a motor nothing tells its buoyancy from inertia; simulated without MuJoCo."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_rpto.tracing import Measurements, trace
+
+MASS, DAMPING, BUOYANCY, DRAG, RATE, NOISE = 0.25, 0.3, 0.9, 0.35, 200, 1e-3
+BALL = f"""<mujoco><option timestep="0.005"/><worldbody><body name="ball">
+<joint name="tube" type="slide" axis="0 0 1" damping="0.2"/><geom size="0.03" mass="{MASS}"/></body></worldbody>
+</mujoco>"""
+
+
+def thrown(rng: np.random.Generator, duration: float = 1.2, steps: int = 10) -> dict[str, np.ndarray]:
+    count, dt = round(duration * RATE), 1 / RATE / steps
+    z, v, seen = 0.0, rng.uniform(-3, 6), np.empty(count)
+    for k in range(count):
+        seen[k] = z
+        for _ in range(steps):
+            v += dt * (-9.81 + (BUOYANCY - DAMPING * v - DRAG * abs(v) * v) / MASS)
+            z += dt * v
+    return {"time": np.arange(count) / RATE, "qpos.tube": seen + NOISE * rng.standard_normal(count)}
+
+
+def test_what_would_do_as_well_is_given_with_its_values_and_what_goes_with_them(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    data = Measurements.from_tables({f"run{i:02}": thrown(rng) for i in range(14)})
+    kinds = ["armature", "torque_offset", "quadratic_drag"]
+    report = trace(BALL, data, ["tube.damping"], candidates=kinds, threads=1)
+    assert report.verdict == "explained"
+    (named,) = (t for t in report.effects if t.stand_ins)
+    assert named.label in ("armature(tube)", "torque_offset(tube)")
+    (other,) = named.stand_ins
+    buoyant, inert = (other, named) if named.label == "armature(tube)" else (named, other)
+    assert buoyant.effect.values[0] == pytest.approx(BUOYANCY, rel=0.05)
+    assert inert.effect.values[0] > 0.1  # what falls more slowly may as well be heavier to move
+    (drag,) = (t.effect.values[0] for t in report.effects if t.label == "quadratic_drag(tube)")
+    both = {"tube.damping", "quadratic_drag(tube) coefficient"}
+    assert set(other.others) == both
+    damping, drag = other.others.values() if other is buoyant else (report.declared[0].effect.values[0], drag)
+    assert damping == pytest.approx(DAMPING, rel=0.1)
+    assert drag == pytest.approx(DRAG, rel=0.1)
+    assert f"{other.effect.label} instead: " in str(report)
+    report.save(tmp_path)
+    stored = json.loads((tmp_path / "report.json").read_text())
+    (kept,) = (e for e in stored["effects"] if e["label"] == named.label)
+    assert kept["instead"][0]["others"] == other.others
+    assert f"{other.effect.label} instead: " in (tmp_path / "report.html").read_text()
