@@ -241,6 +241,8 @@ def _recordings(files: Sequence[str], form: str | None) -> Measurements:
 
 
 def _format_of(file: str) -> str:
+    if Path(file).is_dir():
+        raise ValueError(f"{file} is a folder; name its files, such as {Path(file) / '*.csv'}")
     suffix = Path(file.removesuffix(".gz")).suffix.removeprefix(".").lower()
     if suffix not in FORMATS:
         raise ValueError(f"{file}: recordings are .csv, .csv.gz, .parquet or .npz; name another suffix's by --format")

@@ -91,6 +91,7 @@ def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixtu
     [
         ({"data": "absent.csv"}, "no file matches"),
         ({"data": "runs.mat"}, "--format"),
+        ({"data": ""}, "is a folder; name its files, such as"),
         ({"data": "unknown.csv"}, "has no 'qpos.hinge'"),
         ({"model": "absent.xml"}, "there is no MJCF file"),
         ({"model": "broken.xml"}, "broken.xml"),

@@ -366,7 +366,7 @@ def _find(model: mujoco.MjModel, name: str) -> tuple[str, int, _Kind]:
         raise ValueError(f"{name!r} may be of {' or '.join(having)}; write '{having[0]}:{name}'")
     index = object_id(model, having[0], owner)
     if having[0] == "joint" and model.jnt_type[index] not in SCALAR_JOINTS:
-        raise ValueError(f"{name!r}: joint {owner!r} is neither a hinge nor a slide")
+        raise ValueError(f"{name!r}: joint {owner!r} is neither a hinge nor a slide: set it in the MJCF")
     return having[0], index, _KINDS[having[0]][parameter]
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects import Effect
+from sb3_rpto.effects import Effect, Parameter
 from sb3_rpto.effects.names import SCALAR_JOINTS, object_id, object_names
 from sb3_rpto.effects.units import joint_of
 from sb3_rpto.tracing.measurements import Measurements
@@ -106,12 +106,16 @@ def interval(low: float, high: float, digits: int = 4) -> str:
 def with_numbers(effect: Effect) -> str:
     """The effect's equation with its values in place of the parameters' names."""
     text = effect.equation
-    if effect.place not in ("joint", "actuator", "sensor"):
-        return text  # in words, whose words may be names of parameters
-    for p, value in zip(effect.parameters, effect.values):
+    if effect.place not in ("joint", "actuator", "sensor"):  # in words, whose words may be names of parameters
+        return f"{text} with {', '.join(f'{p.name} {number(v)} {p.unit}'.rstrip() for p, v in _pairs(effect))}"
+    for p, value in _pairs(effect):
         shown = number(value) if value >= 0 else f"({number(value)})"
         text = re.sub(rf"\b{re.escape(p.name)}\b", shown, text)
     return re.sub(r"^\((-[^() ]+)\)", r"\1", text)
+
+
+def _pairs(effect: Effect) -> list[tuple[Parameter, float]]:
+    return list(zip(effect.parameters, effect.values.tolist()))
 
 
 def equation(effects: Sequence[Effect]) -> str:

@@ -173,4 +173,4 @@ def test_equations_have_numbers_for_names() -> None:
     assert wording.with_numbers(ripple) == "0.5 cos(6 q) + (-0.25) sin(6 q)"
     assert wording.with_numbers(TorqueOffset("hinge", offset=-0.5)) == "-0.5"
     # Its equation is in words, one of which is a parameter's name.
-    assert wording.with_numbers(Payload("pole", mass=0.1)) == Payload.equation
+    assert wording.with_numbers(Payload("pole", mass=0.1)) == f"{Payload.equation} with mass 0.1 kg, along 2"
