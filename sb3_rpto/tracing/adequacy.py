@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import binom
@@ -41,6 +41,19 @@ class Adequacy:
 
     def __str__(self) -> str:
         return f"R = {self.ratio:.2f} [{self.low:.2f}, {self.high:.2f}]"
+
+
+def counted_with(select: Adequacy, few: int, fitted: Adequacy, more: int) -> Adequacy:
+    """The same, with the stray windows of a fit counted among those of a few that it was not made to.
+
+    A robust fit gives up what it cannot reach: of few windows too few are of that to deny that it is all.
+
+    :param select: of the ``few`` windows
+    :param fitted: of the ``more`` windows
+    """
+    strays = round(select.strays * few) + round(fitted.strays * more)
+    chance = float(binom.sf(strays - 1, few + more, RARE))
+    return replace(select, strays=strays / (few + more), chance=min(select.chance, chance))
 
 
 def adequacy(problem: Problem, fit: Fit, seed: int) -> Adequacy:

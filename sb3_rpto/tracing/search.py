@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sb3_rpto.tracing.adequacy import Adequacy, adequacy
+from sb3_rpto.tracing.adequacy import Adequacy, adequacy, counted_with
 from sb3_rpto.tracing.calibrate import calibrated
 from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evidence import GAIN
@@ -18,6 +18,8 @@ from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
 
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
+#: Fewer windows than these hardly show that one stretch of motion is not accounted for.
+FEW = 20
 #: Finer steps in time are taken where they lower R by this share: then the steps, not the model, make it.
 FINER = 0.03
 
@@ -274,4 +276,8 @@ def settle(on: Selectors, selection: Selection, screening: Screening) -> Selecti
 
 def judged(selector: Selector, model: Model, seed: int) -> Adequacy:
     """How a model's errors compare with those of the noise alone, on the windows to judge."""
-    return adequacy(selector.judging, selector.judging.score(model.fit.values), seed)
+    seen = adequacy(selector.judging, selector.judging.score(model.fit.values), seed)
+    if selector.select is None or len(selector.select.windows) >= FEW:
+        return seen
+    fitted = adequacy(selector.train, selector.train.score(model.fit.values), seed)
+    return counted_with(seen, len(selector.select.windows), fitted, len(selector.train.windows))
