@@ -124,11 +124,12 @@ class Likes:
                     break
         return model
 
-    def instead(self, model: Model, old: int, new: int, problem: Problem) -> Fit:
-        """Fit ``new`` in the place of ``old`` to other windows, all else of the model with it."""
+    def instead(self, model: Model, old: int, new: int, problem: Problem, starts: np.ndarray) -> Fit:
+        """Fit ``new`` in the place of ``old`` to other windows from their ``starts``, all else of the model with it."""
         values, simulation = self._translated(model, old, new).values, self.selector.simulation
         values[simulation.slices[old]] = simulation.null[simulation.slices[old]]
-        return problem.fit(values, self.selector.free([*(i for i in model.effects if i != old), new]))
+        free = self.selector.free([*(i for i in model.effects if i != old), new])
+        return problem.fit(values, free, starts, EXCHANGED, tolerance=3e-3)
 
     def _kind_everywhere(self, model: Model) -> Model:
         """Try each kind in the place of all others that it resembles, at once: one alone may look no better.

@@ -374,12 +374,12 @@ def _stand_ins(
     """Those of an effect's class that meet the same windows as well, and what else changes with them."""
     simulation = problem.simulation
     (kept,) = (i for i in selection.model.effects if simulation.effects[i].label == traced.label)
-    typical = float(np.median(problem.score(values).errors))
+    final = problem.score(values)
     free = {i for i, e in enumerate(simulation.effects) if e.known or i in selection.model.effects} - {kept}
     found = []
     for other in selection.alike.get(kept, []):
-        fit = likes.instead(selection.model, kept, other, problem)
-        if np.median(fit.errors) > AS_WELL * typical:  # led astray, or too many parameters for one place
+        fit = likes.instead(selection.model, kept, other, problem, final.starts)
+        if np.median(fit.errors) > AS_WELL * np.median(final.errors):  # led astray, or too rich for these data
             continue
         moved = {}
         for i in sorted(free):
