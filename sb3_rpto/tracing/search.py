@@ -19,7 +19,7 @@ from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
 #: Fewer windows than these hardly show that one stretch of motion is not accounted for.
-FEW = 20
+FEW = 10
 #: Finer steps in time are taken where they lower R by this share: then the steps, not the model, make it.
 FINER = 0.03
 
