@@ -80,8 +80,8 @@ class SensorBias(Effect):
     def write(self, world: World, x: np.ndarray) -> None:
         """Feed back what is shown."""
         for i in _readers(self, world.model):
-            bias = world.field("actuator_biasprm")
-            bias[:, i, 0] += bias[:, i, 1] * world.model.actuator_gear[i, 0] * x[:, 0]
+            bias, gear = world.field("actuator_biasprm"), world.field("actuator_gear")
+            bias[:, i, 0] += bias[:, i, 1] * gear[:, i, 0] * x[:, 0]
 
 
 @register

@@ -14,7 +14,7 @@ from sb3_rpto.effects.units import joint_of
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE
 from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor, predictions
+from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor, observed, predictions
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.prepare import SetUp
@@ -176,14 +176,14 @@ def own_steps(
     for one in (simulation, Simulation(nominal, simulation.effects, simulation.nthread)):
         windows = cut(one.model, data, sigma, horizon, STEPPED)
         predicted.append(predictions(one, values, windows)[0])
-    apart = np.sqrt(np.mean((predicted[1] - predicted[0]) ** 2, axis=(0, 1)))
-    worst = int(np.argmax(apart / sigma))
-    if apart[worst] <= sigma[worst]:
+    apart, noise = np.sqrt(np.mean((predicted[1] - predicted[0]) ** 2, axis=(0, 1))), windows.sigma
+    worst = int(np.argmax(apart / noise))
+    if apart[worst] <= noise[worst]:
         return []
     integrator = mujoco.mjtIntegrator(nominal.opt.integrator).name.removeprefix("mjINT_")
     message = (
         f"with its own ({integrator}, {nominal.opt.timestep:g} s) the corrected simulator goes {apart[worst]:.2g} "
-        f"astray in {horizon:g} s at {data.columns.qpos[worst]}, where the noise is {sigma[worst]:.2g}; the errors "
+        f"astray in {horizon:g} s at {observed(data)[worst]}, where the noise is {noise[worst]:.2g}; the errors "
         'after are of finer ones: integrator="RK4" or a shorter timestep in the MJCF\'s <option> keeps them'
     )
     return [Finding("own steps", "corrected simulator", message)]
@@ -192,7 +192,7 @@ def own_steps(
 def no_nearer(before: Sequence[HorizonError], after: Sequence[HorizonError]) -> list[Finding]:
     """Effects that do not explain, and with which runs that nothing was fitted to are predicted worse."""
     pairs = [(b, a) for b, a in zip(before, after) if isinstance(b.horizon, float)]
-    if not pairs or np.mean([np.log(a.rmse / b.rmse).mean() for b, a in pairs]) <= 0:
+    if not pairs or not np.mean([np.log(a.rmse / b.rmse).mean() for b, a in pairs]) > 0:
         return []
     b, a = pairs[-1]
     worst = int(np.argmax(a.rmse / b.rmse))

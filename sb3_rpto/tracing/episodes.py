@@ -101,7 +101,8 @@ def runs_of(file: str, table: Table) -> dict[str | None, dict[str, np.ndarray]]:
         try:
             rows[name] = np.asarray(values).astype(np.float64)
         except (TypeError, ValueError):
-            row, odd = next((i, value) for i, value in enumerate(np.asarray(values)) if not _is_number(value))
+            each = list(enumerate(np.asarray(values)))
+            row, odd = next((pair for pair in each if not _is_number(pair[1])), each[0])
             remedy = "give seconds since the start of the run" if name == "time" else "correct or remove it"
             raise ValueError(
                 f"{file}: column {name!r} holds {odd!r}, which is no number, in row {row} (counted from 0 below the "

@@ -62,7 +62,7 @@ def horizon_errors(
         except ValueError:
             continue
         _, difference, usable = predictions(simulation, values, windows)
-        found.append(_pool(difference, usable, windows, _observed(data), horizon, seed))
+        found.append(_pool(difference, usable, windows, observed(data), horizon, seed))
     whole = whole_runs(simulation, values, data, sigma)
     if whole is not None:
         found.append(whole)
@@ -130,7 +130,7 @@ def whole_runs(
     low, high = _bounds(np.stack([rmses.min(0), rmses.max(0)]), len(rmses))
     return HorizonError(
         "whole run",
-        _observed(data),
+        observed(data),
         np.sqrt(np.mean(pooled**2, axis=0)),
         low,
         high,
@@ -164,10 +164,11 @@ def noise_floor(
         off = problem.predict(np.tile(values, (len(index), 1)), starts, index)
         noise = rng.standard_normal(true.shape) * windows.sigma
         usable = windows.usable[index] & np.isfinite(true).all(-1) & np.isfinite(off).all(-1)
-        pooled = _pool(off - true + noise, usable, windows.take(index), _observed(data), horizon, seed)
+        pooled = _pool(off - true + noise, usable, windows.take(index), observed(data), horizon, seed)
         found.append(replace(pooled, windows=count))
     return found
 
 
-def _observed(data: Measurements) -> tuple[str, ...]:
+def observed(data: Measurements) -> tuple[str, ...]:
+    """The position columns that are compared with predictions."""
     return tuple(name for name in data.columns.qpos if name not in data.unobserved)

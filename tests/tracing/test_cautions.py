@@ -6,9 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from sb3_rpto.effects import Simulation
 from sb3_rpto.effects.forces import Spring, TorqueOffset
-from sb3_rpto.tracing.cautions import above_noise, encoder_zeros, no_nearer
+from sb3_rpto.tracing import Measurements
+from sb3_rpto.tracing.cautions import above_noise, encoder_zeros, no_nearer, own_steps
 from sb3_rpto.tracing.evaluate import HorizonError
+from sb3_rpto.tracing.windows import discretised
 
 SERVO = """<mujoco><worldbody><body><joint name="elbow" axis="0 1 0"/><geom size="0.1"/></body></worldbody>
 <actuator>{}</actuator></mujoco>"""
@@ -33,6 +36,27 @@ def test_what_explains_nothing_and_predicts_worse_is_told() -> None:
     (found,) = no_nearer([ERROR, replace(ERROR, horizon="whole run")], [worse, whole])
     assert "worse with what is listed (b, 0.5 s: 0.001 before, 0.003 after)" in found.message
     assert no_nearer([worse], [ERROR]) == no_nearer([whole], [worse]) == no_nearer([], []) == []
+
+
+PAIR = """<mujoco><option timestep="0.02" integrator="Euler"/><worldbody>
+<body><joint name="still" axis="0 1 0"/><geom size="0.01" mass="1" pos="0 0 -0.3"/></body>
+<body pos="0 1 0"><joint name="swings" axis="0 1 0"/><geom size="0.01" mass="1" pos="0 0 -0.1"/></body>
+</worldbody></mujoco>"""
+
+
+def test_the_models_own_steps_are_compared_where_positions_are() -> None:
+    model = mujoco.MjModel.from_xml_string(PAIR)
+    time = np.arange(200) * 0.02
+    swing = 0.5 * np.cos(np.sqrt(9.81 / 0.1) * time)
+    table = {"time": time, "qpos.still": np.zeros(200), "qpos.swings": swing}
+    data = replace(Measurements.from_tables({"run": table}), unobserved=("still",))
+    fine = Simulation(discretised(model, data, fine=True), [], 1)
+    sigma = np.array([1e-12, 1e-3])
+    (found,) = own_steps(model, fine, fine.null, data, sigma, 0.5)
+    assert "(EULER, 0.02 s)" in found.message
+    assert "at swings, where the noise is 0.001" in found.message
+    model.opt.timestep, model.opt.integrator = 0.002, mujoco.mjtIntegrator.mjINT_RK4
+    assert own_steps(model, fine, fine.null, data, sigma, 0.5) == []
 
 
 def named(actuator: str, torque: float = -3.75) -> list[str]:
