@@ -33,6 +33,8 @@ APART = 3.0
 VAGUE = 0.9
 #: Commands one sample earlier that leave less than this share of the error were logged after they had acted.
 EARLY = 0.5
+#: Share by which test runs must be predicted worse to be told.
+WORSE = 0.05
 #: Most windows that steps in time are compared in.
 STEPPED = 40
 
@@ -192,7 +194,7 @@ def own_steps(
 def no_nearer(before: Sequence[HorizonError], after: Sequence[HorizonError]) -> list[Finding]:
     """Effects that do not explain, and with which runs that nothing was fitted to are predicted worse."""
     pairs = [(b, a) for b, a in zip(before, after) if isinstance(b.horizon, float)]
-    if not pairs or not np.mean([np.log(a.rmse / b.rmse).mean() for b, a in pairs]) > 0:
+    if not pairs or not np.mean([np.log(a.rmse / b.rmse).mean() for b, a in pairs]) > np.log(1 + WORSE):
         return []
     b, a = pairs[-1]
     worst = int(np.argmax(a.rmse / b.rmse))

@@ -28,7 +28,7 @@ from sb3_rpto.tracing.cautions import (
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.concentrate import NOTHING
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
-from sb3_rpto.tracing.identify import Loss, Problem
+from sb3_rpto.tracing.identify import Fit, Loss, Problem
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.missing import missing_forces
@@ -151,13 +151,14 @@ def trace(
         findings += own_steps(set_up.nominal, simulation, final, fitted, sigma, selector.horizon)
     else:
         findings += doubts(set_up.nominal, fitted) + early_response(found, fitted)
-        findings += no_nearer(errors_before, errors_after)
+        findings += no_nearer(errors_before, errors_after) if selection.model.effects else []
     findings += undetermined(problem, final, intervals) + at_bounds(problem, final)
     findings += strays(selector, final, set_up, seed)
     kept = _kept(selection, simulation, final, intervals, selector.limit(selection.model), seed)
     if verdict in SETTLED and found.screening is not None:
         likes = Likes(selector, found.screening)
-        kept = [replace(t, stand_ins=_stand_ins(t, selection, likes, problem, final, intervals)) for t in kept]
+        fit = problem.score(final)
+        kept = [replace(t, stand_ins=_stand_ins(t, selection, likes, problem, fit, intervals)) for t in kept]
     findings += encoder_zeros(simulation.model, [traced.effect for traced in kept])
     for which, values, remedy in (
         ("fitted declared", before.values, "its errors before say no more; give bounds to what you declare"),
@@ -369,12 +370,11 @@ def _kept(
 
 
 def _stand_ins(
-    traced: Traced, selection: Selection, likes: Likes, problem: Problem, values: np.ndarray, intervals: np.ndarray
+    traced: Traced, selection: Selection, likes: Likes, problem: Problem, final: Fit, intervals: np.ndarray
 ) -> list[StandIn]:
     """Those of an effect's class that meet the same windows as well, and what else changes with them."""
     simulation = problem.simulation
     (kept,) = (i for i in selection.model.effects if simulation.effects[i].label == traced.label)
-    final = problem.score(values)
     free = {i for i, e in enumerate(simulation.effects) if e.known or i in selection.model.effects} - {kept}
     found = []
     for other in selection.alike.get(kept, []):
