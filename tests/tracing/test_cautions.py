@@ -35,6 +35,7 @@ def test_what_explains_nothing_and_predicts_worse_is_told() -> None:
     whole = replace(ERROR, horizon="whole run", rmse=np.array([1e-9, 1e-9]))  # of a few runs: chance
     (found,) = no_nearer([ERROR, replace(ERROR, horizon="whole run")], [worse, whole])
     assert "worse with what is listed (b, 0.5 s: 0.001 before, 0.003 after)" in found.message
+    assert no_nearer([ERROR], [replace(ERROR, rmse=1.04 * ERROR.rmse)]) == []  # a trifle
     assert no_nearer([worse], [ERROR]) == no_nearer([whole], [worse]) == no_nearer([], []) == []
 
 
