@@ -100,7 +100,7 @@ class CommandSaturation(Effect):
 
     kind = "command_saturation"
     place = "actuator"
-    parameters = (Parameter("inverse_limit", "1/command", lambda s: 1.2 / s.command, lower=0.0),)
+    parameters = (Parameter("inverse_limit", "1/command", lambda s: 1.2 / s.command, lower=0.0, starts=(0.6,)),)
     equation = "clip(u, -1/inverse_limit, 1/inverse_limit)"
     excite = "the largest commands"
     order = 3

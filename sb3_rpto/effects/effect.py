@@ -48,7 +48,8 @@ class Parameter:
     :param upper: largest value
     :param null: value at which the effect does nothing; for a shape parameter (any value does) where a fit starts
     :param shape: True when the parameter means nothing while the others are at their null values
-    :param starts: of a shape, where a fit may start as well: from its null the others may seem to be of no use
+    :param starts: where a fit may start as well, in sizes from the null: there a shape may hide what the others do, and
+        a limit that nothing reaches does nothing
     """
 
     name: str

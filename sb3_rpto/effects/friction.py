@@ -188,7 +188,7 @@ class PositionFriction(Effect):
     place = "joint"
     parameters = (
         Parameter("amplitude", "N·m", _torque, lower=0.0),
-        Parameter("phase", "rad", 0.5, lower=-np.pi, upper=np.pi, shape=True, starts=(-1.6, 1.6, 3.1)),
+        Parameter("phase", "rad", 0.5, lower=-np.pi, upper=np.pi, shape=True, starts=(-3.2, 3.2, 6.2)),
     )
     equation = "-amplitude (1 + cos(q - phase))/2 sign(qd)"
     excite = "slow motion over a whole turn"

@@ -17,6 +17,10 @@ NOTHING = 0.5
 BLOCKS = 6
 #: Most folds of a cross-validation.
 FOLDS = 6
+#: Windows whose error is above so many units of the noise are missed; noise alone does not come near that.
+MISSED = 2.0
+#: What acts in few windows must save this share of the error of those that are missed without it, in so many blocks.
+RARE, SEVERAL = 0.5, 3
 
 
 @dataclass(frozen=True)
@@ -24,14 +28,16 @@ class Evidence:
     """What a model gains over another on the select windows.
 
     :param gain: share of the typical window error saved, 1 - exp(-mean log ratio)
-    :param t: mean log error ratio of the blocks over its standard error; among less than :data:`BLOCKS` that which has
-        the same level of significance among so many
+    :param t: mean log error ratio of the blocks over its standard error, see :func:`significance`; of the
+        missed windows alone where that is larger and they are few
     :param blocks: the log ratio of each block, (b,)
+    :param missed: that of its windows which the other model misses, NaN where it misses none, (b,)
     """
 
     gain: float
     t: float
     blocks: np.ndarray
+    missed: np.ndarray
 
     def clear(self, threshold: float, gain: float = GAIN) -> bool:
         """Whether the gain is more than chance and more than a trifle."""
@@ -39,30 +45,56 @@ class Evidence:
 
     def frequency(self, limit: tuple[float, float], rng: np.random.Generator, resamples: int = 200) -> float:
         """Share of resampled sets of blocks in which the gain is clear by a limit of t and gain."""
-        n = len(self.blocks)
-        found = [_evidence(self.blocks[rng.integers(n, size=n)]).clear(*limit) for _ in range(resamples)]
-        return float(np.mean(found))
+        draws = [rng.integers(len(self.blocks), size=len(self.blocks)) for _ in range(resamples)]
+        return float(np.mean([evidence_of(self.blocks[rows], self.missed[rows]).clear(*limit) for rows in draws]))
 
 
-def compare(without: np.ndarray, with_: np.ndarray, blocks: np.ndarray) -> Evidence:
+def compare(without: np.ndarray, with_: np.ndarray, blocks: np.ndarray, rare: bool = False) -> Evidence:
     """Evidence for the model with an effect against the one without.
 
     :param without: errors of the windows, (W,)
     :param with_: errors of the same windows, (W,)
     :param blocks: number of the block of each window, (W,)
+    :param rare: whether it may come from few windows, where the typical one is met without the effect
     """
     ratio = np.log(np.maximum(without, NOTHING)) - np.log(np.maximum(with_, NOTHING))
-    return _evidence(np.array([ratio[blocks == b].mean() for b in np.unique(blocks)]))
+    missed = without > MISSED if rare and np.median(without) <= MISSED else np.zeros(len(without), dtype=bool)
+
+    def mean(rows: np.ndarray) -> float:
+        return float(ratio[rows].mean()) if rows.any() else np.nan
+
+    members = [blocks == b for b in np.unique(blocks)]
+    return evidence_of(np.array([mean(m) for m in members]), np.array([mean(m & missed) for m in members]))
 
 
-def _evidence(blocks: np.ndarray) -> Evidence:
-    mean = float(blocks.mean())
+def evidence_of(blocks: np.ndarray, missed: np.ndarray) -> Evidence:
+    """Evidence from log ratios, as :class:`Evidence` has them.
+
+    An effect that acts in a share p of n blocks never has a t above sqrt(n p / (1 - p)), however much it saves there:
+    where the others go without it, those few are what speaks for it.
+    """
+    t, few = significance(blocks), missed[~np.isnan(missed)]
+    if len(few) >= SEVERAL and _gain(few) > RARE:
+        t = max(t, significance(few))
+    return Evidence(_gain(blocks), t, blocks, missed)
+
+
+def several_missed(errors: np.ndarray, blocks: np.ndarray) -> bool:
+    """Whether windows of several blocks are missed: fewer could not speak for an effect."""
+    return len(np.unique(blocks[errors > MISSED])) >= SEVERAL
+
+
+def significance(blocks: np.ndarray) -> float:
+    """Mean over standard error; among less than :data:`BLOCKS` that which is as unlikely by chance among so many."""
     if len(blocks) < 2:
-        return Evidence(1 - float(np.exp(-mean)), 0.0, blocks)
-    error = float(blocks.std(ddof=1)) / np.sqrt(len(blocks))
+        return 0.0
     # Few blocks may agree by chance: their spread counts as at least a percent.
-    error = max(error, 0.01 / np.sqrt(len(blocks)))
-    return Evidence(1 - float(np.exp(-mean)), _among_many(mean / error, len(blocks)), blocks)
+    error = max(float(blocks.std(ddof=1)), 0.01) / np.sqrt(len(blocks))
+    return _among_many(float(blocks.mean()) / error, len(blocks))
+
+
+def _gain(blocks: np.ndarray) -> float:
+    return 1 - float(np.exp(-blocks.mean()))
 
 
 def _among_many(t: float, count: int) -> float:

@@ -12,7 +12,7 @@ from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.tracing import concentrate
 from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.concentrate import concentrated, led_on
-from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
+from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds, several_missed
 from sb3_rpto.tracing.identify import Fit, Linear, Problem
 from sb3_rpto.tracing.windows import Windows
 
@@ -254,7 +254,7 @@ class Selector:
 
     def evidence(self, with_: Model, without: Model) -> Evidence:
         """What ``with_`` gains over ``without`` on windows that neither was fitted to."""
-        return compare(without.errors, with_.errors, self.blocks)
+        return compare(without.errors, with_.errors, self.blocks, rare=not self.train.exact)
 
     def far(self, model: Model) -> bool:
         """Whether what a model lacks, and not the noise, makes its errors."""
@@ -350,7 +350,7 @@ class Selector:
         """
         for _ in range(rounds):
             current = selection.model
-            if np.median(current.errors) < ENOUGH:
+            if np.median(current.errors) < ENOUGH and not several_missed(current.errors, self.blocks):
                 break
             tried: list[tuple[float, Model, int]] = []
             for e, begin in self.promising(current, [c for c in candidates if c not in current.effects]):
@@ -399,7 +399,7 @@ class Selector:
         gains, begins = {}, {}
         for e in self._promised(part, base, model.effects, outside):
             free = self.free([*model.effects, e])
-            trials = [(v, part.fit(v, free, base.starts, REFIT + 1)) for v in self._shapes(base.values, e)]
+            trials = [(v, part.fit(v, free, base.starts, REFIT + 1)) for v in self._begins(base.values, e)]
             values, fit = min(trials, key=lambda trial: trial[1].cost)
             gains[e] = max(float(np.mean(np.log(base.errors) - np.log(fit.errors))), 1 - fit.cost / base.cost)
             s = self.simulation.slices[e]
@@ -417,14 +417,14 @@ class Selector:
         best = sorted(outside, key=lambda e: -falls[e])[:QUICK]
         return [e for e in outside if e in best or any(p.starts for p in self.simulation.effects[e].parameters)]
 
-    def _shapes(self, values: np.ndarray, effect: int) -> list[np.ndarray]:
-        """The parameters with an effect's shape where fits may start."""
+    def _begins(self, values: np.ndarray, effect: int) -> list[np.ndarray]:
+        """The parameters with an effect's own where fits may start."""
         found = [values]
         s = self.simulation.slices[effect]
         for i, parameter in enumerate(self.simulation.effects[effect].parameters, s.start):
             for start in parameter.starts:
                 found.append(values.copy())
-                found[-1][i] = start
+                found[-1][i] = self.simulation.null[i] + start * self.train.size[i]
         return found
 
 

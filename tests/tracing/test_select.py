@@ -96,11 +96,52 @@ def test_one_block_is_no_evidence() -> None:
 
 
 def test_clear_takes_more_than_chance_and_more_than_a_trifle() -> None:
-    blocks = np.zeros(3)
-    assert Evidence(GAIN + 0.01, 4.0, blocks).clear(3.5)
-    assert not Evidence(GAIN + 0.01, 3.4, blocks).clear(3.5)
-    assert not Evidence(GAIN - 0.01, 40.0, blocks).clear(3.5)
-    assert not Evidence(-0.5, -9.0, blocks).clear(3.5)
+    blocks, missed = np.zeros(3), np.full(3, np.nan)
+    assert Evidence(GAIN + 0.01, 4.0, blocks, missed).clear(3.5)
+    assert not Evidence(GAIN + 0.01, 3.4, blocks, missed).clear(3.5)
+    assert not Evidence(GAIN - 0.01, 40.0, blocks, missed).clear(3.5)
+    assert not Evidence(-0.5, -9.0, blocks, missed).clear(3.5)
+
+
+def few_missed(errors: list[float], of: int = 20) -> np.ndarray:
+    """Errors of so many windows, each a block, of which a few are missed and the others met."""
+    return np.r_[errors, np.random.default_rng(0).normal(1.0, 0.02, of - len(errors))]
+
+
+def test_what_acts_in_few_windows_is_clear_by_those() -> None:
+    without, blocks = few_missed([25.0, 30.0, 36.0, 28.0]), np.arange(20)
+    usual = compare(without, np.ones(20), blocks)
+    assert usual.t < np.sqrt(20 * 0.2 / 0.8)  # and no size of theirs would change that
+    assert not usual.clear(THRESHOLD)
+    rare = compare(without, np.ones(20), blocks, rare=True)
+    assert (rare.gain, rare.clear(THRESHOLD)) == (usual.gain, True)
+    log = np.log([25.0, 30.0, 36.0, 28.0])  # of four blocks: what is as unlikely among six
+    assert student.sf(rare.t, 5) == pytest.approx(student.sf(log.mean() / (log.std(ddof=1) / 2), 3))
+    resampled = rare.frequency((THRESHOLD, GAIN), np.random.default_rng(0), resamples=2000)
+    draws = np.random.default_rng(1).integers(20, size=(2000, 20)) < 4
+    assert resampled == pytest.approx(np.mean(draws.sum(1) >= 3), abs=0.03)  # three are needed, and enough
+
+
+@pytest.mark.parametrize(
+    ("errors", "left"),
+    [
+        pytest.param([25.0, 30.0], 1.0, id="two of them"),
+        pytest.param([25.0, 30.0, 36.0], 20.0, id="little gained"),
+        pytest.param([25.0, 25.0, 5.0, 2.5], 4.9, id="not in all"),
+        pytest.param([1.9] * 4, 0.9, id="not missed"),
+        pytest.param([30.0] * 11, 1.0, id="the typical one is missed, too"),
+    ],
+)
+def test_few_windows_that_do_not_speak_for_it_change_nothing(errors: list[float], left: float) -> None:
+    without, blocks = few_missed(errors), np.arange(20)
+    with_ = np.where(without > 1.5, left, without)
+    assert compare(without, with_, blocks, rare=True).t == compare(without, with_, blocks).t
+
+
+def test_what_helps_few_windows_and_harms_the_others_is_not_clear() -> None:
+    without, blocks = few_missed([25.0, 30.0, 36.0, 28.0]), np.arange(20)
+    with_ = np.where(without > 1.5, 1.0, 3 * without)
+    assert not compare(without, with_, blocks, rare=True).clear(THRESHOLD)
 
 
 def test_errors_of_zero_are_compared_without_infinities() -> None:
