@@ -101,7 +101,7 @@ class DCMotor(Effect):
     kind = "dc_motor"
     place = "actuator"
     parameters = (
-        Parameter("inverse_stall", "1/(N·m)", lambda s: 1.2 / s.torque, lower=0.0, starts=(0.6,)),
+        Parameter("inverse_stall", "1/(N·m)", lambda s: 1.2 / s.torque, lower=0.0),
         Parameter("inverse_speed", "s/rad", lambda s: 1.2 / s.velocity, lower=0.0),
     )
     equation = "|tau| <= (1 - inverse_speed |qd| [tau qd > 0]) / inverse_stall"
