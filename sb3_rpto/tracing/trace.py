@@ -38,7 +38,7 @@ from sb3_rpto.tracing.prepare import Progress, SetUp, prepare
 from sb3_rpto.tracing.report import Candidate, Report, StandIn, Traced
 from sb3_rpto.tracing.residuals import learnable_share, summary
 from sb3_rpto.tracing.screen import Screening
-from sb3_rpto.tracing.search import Found, find
+from sb3_rpto.tracing.search import Found, find, worth_a_look
 from sb3_rpto.tracing.select import Selection, Selector
 from sb3_rpto.tracing.windows import Windows
 
@@ -172,7 +172,7 @@ def trace(
         verdict=verdict,
         declared=_declared(simulation, final, intervals),
         effects=kept,
-        candidates=_fates(simulation, found.screening, selection),
+        candidates=_fates(selector, found.screening, selection),
         adequacy_before=found.before,
         adequacy_after=found.after,
         before=errors_before,
@@ -392,18 +392,19 @@ def _stand_ins(
     return found
 
 
-def _fates(simulation: Simulation, screening: Screening | None, selection: Selection) -> list[Candidate]:
+def _fates(selector: Selector, screening: Screening | None, selection: Selection) -> list[Candidate]:
     """What became of each candidate."""
-    labels = [e.label for e in simulation.effects]
-    candidates = [(i, e) for i, e in enumerate(simulation.effects) if not e.known]
-    return [_candidate(i, e, screening, selection, labels) for i, e in candidates]
+    effects = selector.simulation.effects
+    candidates = [(i, e) for i, e in enumerate(effects) if not e.known]
+    if screening is None:
+        return [Candidate(e.label, "not needed", "the declared model is complete", 0.0) for _, e in candidates]
+    labels, tried = [e.label for e in effects], worth_a_look(selector, screening)
+    return [_candidate(i, e, screening, selection, labels, tried) for i, e in candidates]
 
 
 def _candidate(
-    i: int, effect: Effect, screening: Screening | None, selection: Selection, labels: list[str]
+    i: int, effect: Effect, screening: Screening, selection: Selection, labels: list[str], tried: list[int]
 ) -> Candidate:
-    if screening is None:
-        return Candidate(effect.label, "not needed", "the declared model is complete", 0.0)
     sensitivity = float(screening.sensitivity[i])
     alike = [labels[j] for j in screening.alike(i)]
     if i in selection.model.effects:
@@ -423,4 +424,6 @@ def _candidate(
         why = f"{what} costs {evidence.gain:+.1%} of the error (t = {evidence.t:.1f})"
         when = f"step {step}" if step else "at the end"
         return Candidate(effect.label, "dropped", f"{when}: {why}", sensitivity, alike)
-    return Candidate(effect.label, "dropped", f"looks like {alike[0]}" if alike else _NEVER, sensitivity, alike)
+    in_its_place = [labels[j] for j in screening.alike(i) if j in tried]
+    why = _NEVER if i in tried else f"looks like {in_its_place[0]}, which was tried"
+    return Candidate(effect.label, "dropped", why, sensitivity, alike)

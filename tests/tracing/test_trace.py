@@ -191,6 +191,15 @@ def test_what_lies_outside_the_library_is_not_explained() -> None:
     assert not report.adequacy_before.adequate
 
 
+def test_of_what_looks_alike_one_is_tried_for_all() -> None:
+    p = planted(("wind_gusts", "large"))
+    late, slow = trace(p.xml, p.measurements, p.declared, candidates=["command_delay", "actuator_lag"]).candidates
+    assert late.status == slow.status == "dropped"
+    tried, other = (late, slow) if "unseen windows" in late.reason else (slow, late)
+    assert "unseen windows" in tried.reason
+    assert other.reason == f"looks like {tried.label}, which was tried"
+
+
 def test_an_effect_that_is_not_among_the_candidates_is_not_explained() -> None:
     report = traced_simply(kinds=["torque_offset"])
     assert report.verdict == "unexplained"
