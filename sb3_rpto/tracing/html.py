@@ -54,9 +54,10 @@ METHOD = (
     "all that remained were needed.",
     "An effect is needed when its loss raises the log error of blocks of select windows clearly (t above the "
     "threshold) and by more than 3 %; far from the noise, where other missing effects spread the blocks, a t of 2 is "
-    "enough and a tenth is needed. Like effects were then tried in its place: those that do as well form its class.",
+    "enough and a tenth is needed. Where the typical window is met without it, the few that are missed speak for it by "
+    "themselves. Like effects were then tried in its place: those that do as well form its class.",
     "The kept effects and the declared parameters were fitted once more to train and select runs; their intervals "
-    "come from resampling blocks of windows.",
+    "come from how the blocks of windows scatter.",
     "Errors, missing forces and the curves above are those of the test runs, where there are any.",
 )
 

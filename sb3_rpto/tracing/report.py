@@ -55,7 +55,7 @@ class Traced:
 
     :param effect: with the values found
     :param units: of its parameters where it sits
-    :param interval: 95 % intervals of the parameters by resampling blocks, (2, p)
+    :param interval: 95 % intervals of the parameters from how blocks scatter, (2, p)
     :param alike: effects that explain the data as well: together they are its equivalence class
     :param gain: share of the typical window error that it saves
     :param t: of that gain

@@ -8,8 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student
 
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.units import units_at
@@ -29,6 +27,7 @@ from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.concentrate import NOTHING
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Fit, Loss, Problem
+from sb3_rpto.tracing.intervals import half_widths
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.missing import missing_forces
@@ -125,7 +124,7 @@ def trace(
     say(0.85, "fitting the final model")
     parts = [p.windows for p in (selector.train, selector.select) if p is not None]
     problem = Problem(simulation, parts[0] if len(parts) == 1 else join(*parts), set_up.scales)
-    final, intervals = refit(selection, problem, seed)
+    final, intervals = refit(selection, problem)
     # Both models are fitted to the same data before they are compared on the test runs.
     before = problem.fit(found.base.fit.values, selector.free(()), iterations=FINAL)
 
@@ -235,10 +234,10 @@ def _steady(progress: Progress | None) -> Progress:
     return say
 
 
-def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 200) -> tuple[np.ndarray, np.ndarray]:
-    """Fit on train and select together; intervals by resampling blocks.
+def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Fit on train and select together.
 
-    :return: all parameters (p,), and their 2.5 % and 97.5 % quantiles (2, p), NaN where nothing was fitted: what
+    :return: all parameters (p,), and the bounds of their 95 % intervals (2, p), NaN where nothing was fitted: what
         shows in no window is what it was
     """
     joined = problem.windows
@@ -250,28 +249,13 @@ def refit(selection: Selection, problem: Problem, seed: int, resamples: int = 20
         curvature = np.einsum("wff->f", linear.normal)
         hidden = free[curvature <= NOTHING * curvature.max()]
         values[hidden] = problem.null[hidden]
-        ridge = 1e-9 * np.eye(len(free)) * max(1e-12, float(np.trace(linear.normal.sum(0))))
-        blocks = [np.flatnonzero(joined.block == b) for b in np.unique(joined.block)]
-        rng = np.random.default_rng(seed)
-        moves = []
-        for _ in range(resamples):
-            rows = np.concatenate([blocks[i] for i in rng.integers(len(blocks), size=len(blocks))])
-            # The mean gradient is not quite zero at a bound; only its scatter matters.
-            gradient = linear.gradient[rows].sum(0) - linear.gradient.sum(0) * len(rows) / len(joined)
-            moves.append(-np.linalg.solve(linear.normal[rows].sum(0) + ridge, gradient) * problem.size[free])
         r = problem.residuals(np.tile(fit.values, (len(joined), 1)), fit.starts, np.arange(len(joined)))
         r = r[np.repeat(joined.usable, joined.measured.shape[2], axis=1)]
-        if len(blocks) > 1:  # a single one does not scatter
-            wider = widening(len(blocks)) / Loss.of(r).curvature(r)
-            intervals[:, free] = fit.values[free] + wider * np.quantile(moves, [0.025, 0.975], axis=0)
-            intervals = np.clip(intervals, problem.lower, problem.upper)
+        half = half_widths(linear, joined.block) * problem.size[free] / Loss.of(r).curvature(r)
+        intervals[:, free] = fit.values[free] + np.array([-1, 1])[:, None] * half
+        intervals = np.clip(intervals, problem.lower, problem.upper)
         intervals[:, hidden] = np.nan
     return values, intervals
-
-
-def widening(blocks: int) -> float:
-    """How much wider than resampling says an interval of so many blocks is: as one of t, which knows their scatter."""
-    return float(np.sqrt(blocks / (blocks - 1)) * student.ppf(0.975, blocks - 1) / norm.ppf(0.975))
 
 
 def join(a: Windows, b: Windows) -> Windows:

@@ -26,7 +26,7 @@ from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.adequacy import Adequacy
 from sb3_rpto.tracing.prepare import SetUp, prepare
-from sb3_rpto.tracing.trace import judge, widening
+from sb3_rpto.tracing.trace import judge
 
 #: the longest steps that the recording and the trace may have
 COARSE = PENDULUM.replace('timestep="0.005"', 'timestep="0.01"')
@@ -487,15 +487,6 @@ def test_a_declared_number_that_ends_at_its_bound_is_named() -> None:
 def test_data_that_were_not_read_are_refused_at_once() -> None:
     with pytest.raises(TypeError, match="data must be Measurements, not str"):
         trace(PENDULUM, "runs/*.csv")  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("blocks", [3, 5, 16])
-def test_intervals_from_few_blocks_are_as_wide_as_those_of_t(blocks: int) -> None:
-    """Those of resampled means alone hold the true mean of five in 85 %."""
-    drawn = np.random.default_rng(blocks).standard_normal((4_000, blocks))
-    resampled = drawn.std(axis=1) / np.sqrt(blocks)  # of the mean, over infinitely many resamples
-    held = np.abs(drawn.mean(axis=1)) < widening(blocks) * 1.96 * resampled
-    assert np.mean(held) == pytest.approx(0.95, abs=0.012)
 
 
 # --- effects that are known beforehand --------------------------------------------------------------------------------
