@@ -391,7 +391,7 @@ class Selector:
     def promising(self, model: Model, outside: Sequence[int]) -> list[tuple[int, Fit]]:
         """The effects outside that lower the log errors or the cost most in a short fit to every third window.
 
-        :return: each with where a fit may begin: the model's, and the shape that did best
+        :return: each with where a fit may begin: the model's, with the effect's own start that did best
         """
         some = np.arange(0, len(self.train.windows), 3)
         part, begin = self.train.on(some), model.fit.starts[some]
@@ -409,7 +409,7 @@ class Selector:
         return [(e, begins[e]) for e in best if gains[e] > GAIN]
 
     def _promised(self, part: Problem, base: Fit, kept: Sequence[int], outside: Sequence[int]) -> list[int]:
-        """The effects outside that promise most to first order, and those that may promise more with another shape."""
+        """The effects outside that promise most to first order, and those that may promise more from another start."""
         every = self.free([*kept, *outside])
         linear = part.linear(base, every)
         rows = {e: np.flatnonzero(np.isin(every, self.free([*kept, e]))) for e in outside}
