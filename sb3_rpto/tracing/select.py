@@ -27,6 +27,9 @@ NEARLY = 10.0
 LIKELY = 2.0
 #: Share of the error that counts there: of the many effects that would fit a little of what lacks, few are named.
 TENTH = 0.1
+#: Windows left out move a parameter as if it were known beforehand to this many plausible sizes, to the power of -2:
+#: what they hardly show, like a tilt that acts to second order, would go astray.
+UNTOLD = 1.0
 #: Iterations of a refit that begins at the larger model's optimum.
 REFIT = 5
 #: Iterations of the joint fit of all candidates.
@@ -245,7 +248,7 @@ class Selector:
             low, high = ((b[free] - fit.values[free]) / train.size[free] for b in (train.lower, train.upper))
             for others, judged in self.folds:
                 normal, gradient = linear.normal[others].sum(0), linear.gradient[others].sum(0)
-                normal = normal + np.diag(1e-3 * np.diag(normal) + 1e-9)
+                normal = normal + np.diag(1e-3 * np.diag(normal) + UNTOLD)
                 move = bounded_step(normal, gradient, low, high) * train.size[free]
                 rows[np.ix_(judged, free)] += move
         errors = train.score(rows, fit.starts, iterations=1).errors
