@@ -26,6 +26,10 @@ SHARES = (1.0, 0.2)
 LADDER = ((0.1,), (1.0, 10.0, 100.0), (1e4, 1e6))
 #: Share of the promised fall of the cost that is enough to take a step without looking further.
 KEPT = 0.5
+#: Typical error, in units of the noise, above which it is the model's more than the noise's.
+FAR = 2.0
+#: Fits to measured data end there when the cost falls by less than this share.
+CRUDE = 0.01
 #: All windows' errors below so many units of the noise, for exact data 1e-7 of what a position varies by, are met.
 MET = 1e-3
 #: Most simulations in one batch.
@@ -260,7 +264,7 @@ class Problem:
         :param free: indices, (f,)
         :param starts: as in :class:`Fit`; default: the smoothed states
         :param iterations: most steps
-        :param tolerance: stop when the cost falls by less than this share
+        :param tolerance: stop when the cost falls by less than this share, or than :data:`CRUDE` where that is more
         :return: never worse than where it began, if that is within the bounds
         """
         values, damping, linear = values.copy(), 1e-3, None
@@ -272,14 +276,16 @@ class Problem:
             now = float(self.cost(r, starts, values, loss))
             reduced = self.reduce(r, jt, jx, starts, loss)
             promised = self._promise(values, free, reduced, LADDER[0][0] * damping)
-            if promised < tolerance * now or self.errors(r).max() < MET:
+            crude = loss.clip > 3 * FAR and not (self.exact or self.touching)
+            enough = max(tolerance, CRUDE) * now if crude else tolerance * now
+            if promised < enough or self.errors(r).max() < MET:
                 linear = Linear(reduced.normal, reduced.gradient, free)
                 break
             step = self._descend(values, starts, free, reduced, damping, loss, now, promised)
             if step.cost < now:
                 values, starts, r = step.values, step.starts, step.residuals
                 damping = float(np.clip(step.damping, 1e-6, 1e6))
-            if now - step.cost < tolerance * now:
+            if now - step.cost < enough:
                 break
         return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, Loss.of(r))), linear)
 

@@ -13,14 +13,12 @@ from sb3_rpto.tracing import concentrate
 from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.concentrate import concentrated, led_on
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds, several_missed
-from sb3_rpto.tracing.identify import Fit, Linear, Problem
+from sb3_rpto.tracing.identify import FAR, Fit, Linear, Problem
 from sb3_rpto.tracing.windows import Windows
 
 #: t*, well above what complete sets need to have nothing named (`benchmark threshold`: at most 2.0 in 30, most 0), as
 #: real noise is not theirs; `calibrate` measures it for the data at hand.
 THRESHOLD = 3.5
-#: Typical window error, in units of the noise, above which it is the model's more than the noise's.
-FAR = 2.0
 #: A model of exact data that typically errs by less may only be held by kinks.
 NEARLY = 10.0
 #: t* there: what else lacks, not the noise, spreads the blocks, and the 98 % quantile of one test is the best there is.
@@ -139,7 +137,7 @@ class Selector:
         return np.flatnonzero(chosen | (self.train.known & self.simulation.strength))
 
     def together(self, effects: Sequence[int], base: Fit, begin: Fit) -> tuple[Model, Model | None]:
-        """Fit all candidates at once; where that ends badly, again from the best few of their kinds.
+        """Fit all candidates at once; where that ends badly, again from the best few of their kinds if these do better.
 
         The cost has local minima where many effects begin at their nulls.
 
@@ -152,8 +150,9 @@ class Selector:
         best, few = self.train.fit(begin.values, free, begin.starts, JOINT, tolerance=3e-3), None
         if np.median(best.errors) > ENOUGH:
             few = self._best_few(effects, base)
-            other = self.train.fit(few.fit.values, free, base.starts, JOINT, tolerance=3e-3)
-            best = min(best, other, key=lambda fit: fit.cost)
+            if np.median(few.fit.errors) < np.median(best.errors):
+                other = self.train.fit(few.fit.values, free, base.starts, JOINT, tolerance=3e-3)
+                best = min(best, other, key=lambda fit: fit.cost)
         return self.model(effects, best), few
 
     def one_kind(self, effects: Sequence[int], base: Fit) -> Model | None:

@@ -11,6 +11,7 @@ from scipy.stats import ttest_1samp
 from simulated import PENDULUM, compiled, problem, recorded
 
 from sb3_rpto.effects import declare
+from sb3_rpto.effects.bodies import GravityTilt
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, PositionFriction, QuadraticDrag, StribeckFriction
@@ -162,6 +163,16 @@ def test_frequency_is_the_share_of_resamples_that_are_clear() -> None:
     assert 0.1 < expected < 0.9
     found = evidence.frequency((3.5, GAIN), np.random.default_rng(3), resamples=2000)
     assert found == pytest.approx(expected, abs=0.05)
+
+
+def test_windows_left_out_do_not_lead_astray_what_hardly_shows() -> None:
+    """Gravity that tilts along the axis of a hinge acts to second order: a straight line leads anywhere."""
+    s = selector([CoulombFriction("hinge", level=0.08)], [CoulombFriction("hinge"), GravityTilt()], seed=1)
+    one = s.model([0], s.train.score(s.train.null))
+    beside = one.fit.values + np.array([0.0, 0.002, 0.0])
+    two = Model((0, 1), s.train.fit(beside, s.free([0, 1]), one.fit.starts), np.empty(0))
+    errors = s._errors(two.fit, two.effects)
+    assert abs(compare(errors, one.errors, s.blocks).gain) < 0.003  # 0.048 where moves know no plausible size
 
 
 # --- fits and elimination ---------------------------------------------------------------------------------------------
