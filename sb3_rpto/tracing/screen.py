@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_rpto.tracing.identify import Fit, Loss, Problem
+from sb3_rpto.tracing.identify import Fit, Problem
+from sb3_rpto.tracing.loss import Loss
 
 #: A candidate of plausible size that moves all residuals together by less than this many units of noise is not excited.
 EXCITED = 4.0

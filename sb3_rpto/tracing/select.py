@@ -13,7 +13,8 @@ from sb3_rpto.tracing import concentrate
 from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.concentrate import concentrated, led_on
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds, several_missed
-from sb3_rpto.tracing.identify import FAR, Fit, Linear, Problem
+from sb3_rpto.tracing.identify import Fit, Linear, Problem
+from sb3_rpto.tracing.loss import FAR
 from sb3_rpto.tracing.windows import Windows
 
 #: t*, well above what complete sets need to have nothing named (`benchmark threshold`: at most 2.0 in 30, most 0), as

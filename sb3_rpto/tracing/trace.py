@@ -26,9 +26,10 @@ from sb3_rpto.tracing.cautions import (
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.concentrate import NOTHING
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
-from sb3_rpto.tracing.identify import Fit, Loss, Problem
+from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.intervals import half_widths
 from sb3_rpto.tracing.likes import Likes
+from sb3_rpto.tracing.loss import Loss
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.missing import missing_forces
 from sb3_rpto.tracing.model_checks import doubts

@@ -17,9 +17,10 @@ from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, PositionFriction, QuadraticDrag, StribeckFriction
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit
+from sb3_rpto.tracing.loss import FAR
 from sb3_rpto.tracing.screen import screen
 from sb3_rpto.tracing.search import Selectors, aligned, search
-from sb3_rpto.tracing.select import FAR, INSTEAD, LIKELY, ROUNDS, TENTH, Model, Selection, Selector
+from sb3_rpto.tracing.select import INSTEAD, LIKELY, ROUNDS, TENTH, Model, Selection, Selector
 from sb3_rpto.tracing.windows import cut
 
 THRESHOLD = 3.5
