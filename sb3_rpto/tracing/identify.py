@@ -26,7 +26,7 @@ SHARES = (1.0, 0.2)
 LADDER = ((0.1,), (1.0, 10.0, 100.0), (1e4, 1e6))
 #: Share of the promised fall of the cost that is enough to take a step without looking further.
 KEPT = 0.5
-#: Fits to measured data end there when the cost falls by less than this share, and so does the typical window's.
+#: Fits to measured data far from the noise end when the cost falls by less than this share: what is missing makes it.
 CRUDE = 0.01
 #: All windows' errors below so many units of the noise, for exact data 1e-7 of what a position varies by, are met.
 MET = 1e-3
@@ -222,6 +222,7 @@ class Problem:
         starts: np.ndarray | None = None,
         iterations: int = 12,
         tolerance: float = 1e-3,
+        crude: float = CRUDE,
     ) -> Fit:
         """Levenberg-Marquardt on the free parameters and all starts, within the bounds.
 
@@ -230,6 +231,7 @@ class Problem:
         :param starts: as in :class:`Fit`; default: the smoothed states
         :param iterations: most steps
         :param tolerance: stop when the cost falls by less than this share
+        :param crude: the same of measured data far from the noise, where the typical window's falls no more either
         :return: never worse than where it began, if that is within the bounds
         """
         values, damping, linear = values.copy(), 1e-3, None
@@ -245,7 +247,7 @@ class Problem:
                 linear = Linear(reduced.normal, reduced.gradient, free)
                 break
             step = self._descend(values, starts, free, reduced, damping, loss, now, promised)
-            slow = self._slow(loss, (r, starts), step, now)
+            slow = loss.far and self._slow(loss, (r, starts), step, now, crude)
             if step.cost < now:
                 values, starts, r = step.values, step.starts, step.residuals
                 damping = float(np.clip(step.damping, 1e-6, 1e6))
@@ -253,15 +255,15 @@ class Problem:
                 break
         return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, Loss.of(r))), linear)
 
-    def _slow(self, loss: Loss, before: tuple[np.ndarray, np.ndarray], step: _Step, now: float) -> bool:
-        """Whether measured data far from the noise are hardly met better by a step, as a whole and typically.
+    def _slow(self, loss: Loss, before: tuple[np.ndarray, np.ndarray], step: _Step, now: float, share: float) -> bool:
+        """Whether measured data are met better by less than a share after a step, as a whole and typically.
 
         In kinks, which contacts make and exact data show, fits creep before they get on.
         """
-        if not loss.far or self.exact or self.touching or now - step.cost > CRUDE * now:
+        if self.exact or self.touching or now - step.cost > share * now:
             return False
         ratio = loss.energy(step.residuals, step.starts) / np.maximum(loss.energy(*before), 1e-300)
-        return bool(np.median(ratio) > 1 - CRUDE)
+        return bool(np.median(ratio) > 1 - share)
 
     def _promise(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced, damping: float) -> float:
         """How far the cost would fall with a step if it were quadratic."""

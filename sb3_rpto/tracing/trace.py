@@ -127,7 +127,7 @@ def trace(
     problem = Problem(simulation, parts[0] if len(parts) == 1 else join(*parts), set_up.scales)
     final, intervals = refit(selection, problem)
     # Both models are fitted to the same data before they are compared on the test runs.
-    before = problem.fit(found.base.fit.values, selector.free(()), iterations=FINAL)
+    before = problem.fit(found.base.fit.values, selector.free(()), iterations=FINAL, crude=0.0)
 
     say(0.9, "predicting the test runs")
     data = set_up.test if set_up.test.episodes else fitted
@@ -243,7 +243,7 @@ def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarra
     """
     joined = problem.windows
     free = Selector(problem, problem, 0.0, lambda share, what: None).free(selection.model.effects)
-    fit = problem.fit(selection.model.fit.values, free, iterations=FINAL)
+    fit = problem.fit(selection.model.fit.values, free, iterations=FINAL, crude=0.0)
     values, intervals = fit.values.copy(), np.full((2, len(fit.values)), np.nan)
     if len(free):
         linear = problem.linear(fit, free)

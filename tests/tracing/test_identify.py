@@ -17,9 +17,9 @@ from sb3_rpto.effects.effect import Effect, Parameter
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.effects.sensors import SensorBias, SensorDelay, SensorGain
-from sb3_rpto.tracing import Measurements, identify
+from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.box import bounded_step
-from sb3_rpto.tracing.identify import RIDGE, UNSTABLE, Fit, Problem
+from sb3_rpto.tracing.identify import CRUDE, RIDGE, UNSTABLE, Fit, Problem
 from sb3_rpto.tracing.interpolation import interpolate
 from sb3_rpto.tracing.loss import FAR, Loss
 from sb3_rpto.tracing.starts import TRUST
@@ -374,27 +374,26 @@ def test_an_estimate_scatters_as_the_curvature_of_the_loss_says(tails: float) ->
 
 
 def counted(p: Problem, monkeypatch: pytest.MonkeyPatch, crude: float) -> tuple[Fit, int]:
-    """A fit of all parameters with another :data:`CRUDE`, and how many derivatives it took."""
+    """A fit of all parameters with this share far from the noise, and how many derivatives it took."""
     calls, once = [], p.linearise
     with monkeypatch.context() as patch:
-        patch.setattr(identify, "CRUDE", crude)
         patch.setattr(p, "linearise", lambda *a: calls.append(1) or once(*a))
-        return p.fit(p.null, np.arange(2), iterations=20, tolerance=1e-6), len(calls)
+        return p.fit(p.null, np.arange(2), iterations=20, tolerance=1e-6, crude=crude), len(calls)
 
 
 def test_fits_far_from_the_noise_end_sooner_and_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     near = declared_problem()
-    (soon, calls), (late, others) = (counted(near, monkeypatch, crude) for crude in (identify.CRUDE, 0.0))
+    (soon, calls), (late, others) = (counted(near, monkeypatch, crude) for crude in (CRUDE, 0.0))
     assert calls == others
     np.testing.assert_array_equal(soon.values, late.values)
     data = recorded([*true_effects(), CoulombFriction("hinge", level=0.3)])
     far = problem(declare(compiled(), DECLARED), data, noise=1e-3)
-    (soon, calls), (late, others) = (counted(far, monkeypatch, crude) for crude in (identify.CRUDE, 0.0))
+    (soon, calls), (late, others) = (counted(far, monkeypatch, crude) for crude in (CRUDE, 0.0))
     assert np.median(late.errors) > FAR
     assert calls < others
     assert late.cost <= soon.cost < 1.05 * late.cost
     exact = replace(far.windows, exact=True)
-    _, calls = counted(Problem(far.simulation, exact, far.scales), monkeypatch, identify.CRUDE)
+    _, calls = counted(Problem(far.simulation, exact, far.scales), monkeypatch, CRUDE)
     assert calls == others
 
 
