@@ -83,7 +83,7 @@ class SetUp:
     longer: float | None
 
     def selectors(self, horizon: float, say: Progress) -> Selectors:
-        """Selectors on windows of a length in s."""
+        """Selectors on windows of a length in s; longer ones begin where the others do."""
         fine, rough = (
             Selector.on(s, self._windows(s.model, horizon), self.scales, horizon, say) for s in (self.fine, self.rough)
         )
@@ -100,7 +100,7 @@ class SetUp:
         return replace(self.selectors(horizon, say), fine=fine)
 
     def _windows(self, model: mujoco.MjModel, horizon: float) -> tuple[Windows, Windows | None]:
-        return windows(model, self.train, self.select, self.sigma, horizon)
+        return windows(model, self.train, self.select, self.sigma, horizon, 1 - self.length / horizon)
 
 
 def _own_step(model: Any) -> list[Finding]:
@@ -239,7 +239,7 @@ def _longer(
     if sum(int((e.time[-1] - e.time[0]) / longer) for e in episodes) < FEW // 2:
         return None
     try:
-        windows(model, train, select, sigma, longer)
+        windows(model, train, select, sigma, longer, 1 - length / longer)
     except ValueError:  # in too few blocks
         return None
     return longer
@@ -251,16 +251,17 @@ def windows(
     select: Measurements,
     sigma: np.ndarray,
     horizon: float,
+    overlap: float,
 ) -> tuple[Windows, Windows | None]:
     """Windows to fit and to select on; None to select on where too little is set apart: then blocks take turns."""
     many = MANY if train.touching else 1
     if any(e.time[-1] - e.time[0] >= 2 * horizon for e in select.episodes):
-        judging = cut(model, select, sigma, horizon, many * SELECT)
+        judging = cut(model, select, sigma, horizon, many * SELECT, overlap)
         # A single block is no evidence for anything.
         if len(np.unique(judging.block)) > 1:
-            return cut(model, train, sigma, horizon, many * TRAIN), judging
+            return cut(model, train, sigma, horizon, many * TRAIN, overlap), judging
     train = replace(train, episodes=train.episodes + select.episodes)
-    every = cut(model, train, sigma, horizon, many * (TRAIN + SELECT))
+    every = cut(model, train, sigma, horizon, many * (TRAIN + SELECT), overlap)
     few = len(every) < FEW
     if few:
         every = cut(model, train, sigma, horizon, 2 * FEW, overlap=OVERLAP)
