@@ -166,6 +166,24 @@ def test_frequency_is_the_share_of_resamples_that_are_clear() -> None:
     assert found == pytest.approx(expected, abs=0.05)
 
 
+def test_the_joint_fit_begins_again_from_kinds_that_do_no_better_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They may be near a lower minimum all the same: beside them an effect that acts in few windows shows."""
+    s = selector([CoulombFriction("hinge", level=0.08)])
+    windows, base = len(s.train.windows), s.train.score(s.train.null)
+
+    def fitted(first: float, error: float, cost: float) -> Fit:
+        values = np.full_like(base.values, first)
+        return Fit(values, base.starts, np.full(windows, error), cost)
+
+    few = Model((COULOMB,), fitted(1.0, 1.5, 30.0), np.empty(0))
+    ends = {0.0: fitted(0.1, 1.3, 20.0), 1.0: fitted(1.1, 1.0, 10.0)}
+    monkeypatch.setattr(s, "_best_few", lambda *a: few)
+    monkeypatch.setattr(s.train, "fit", lambda values, *a, **k: ends[values[0]])
+    monkeypatch.setattr(s, "model", lambda effects, begin: Model(tuple(effects), begin, begin.errors))
+    model, _ = s.together([COULOMB, OFFSET, DRAG], base, fitted(0.0, 2.0, 40.0))
+    assert model.fit is ends[1.0]
+
+
 def test_windows_left_out_do_not_lead_astray_what_hardly_shows() -> None:
     """Gravity that tilts along the axis of a hinge acts to second order: a straight line leads anywhere."""
     s = selector([CoulombFriction("hinge", level=0.08)], [CoulombFriction("hinge"), GravityTilt()], seed=1)

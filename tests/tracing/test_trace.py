@@ -25,7 +25,7 @@ from sb3_rpto.effects.library import given
 from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.adequacy import Adequacy
-from sb3_rpto.tracing.prepare import SetUp, prepare
+from sb3_rpto.tracing.prepare import LONGER, SetUp, prepare
 from sb3_rpto.tracing.trace import judge
 
 #: the longest steps that the recording and the trace may have
@@ -214,6 +214,18 @@ def test_where_much_is_left_to_explain_longer_windows_are_looked_at() -> None:
         assert [t.label for t in report.effects] == ["coulomb_friction(hinge)"]
         assert report.verdict in ("unexplained", "partly explained")
         assert report.horizon == used, "who gives a length has it"
+
+
+def test_longer_windows_begin_where_the_others_do() -> None:
+    """Laid side by side they are half as many, and what acts little no longer shows in them."""
+    data = recorded([], compiled(COARSE), 9, 3.2, rate=50)
+    made = prepare(COARSE, data, ["hinge.damping"], 0, ["coulomb_friction"], None, 1, simulated=True)
+    assert made.longer == LONGER * made.length
+    usual, longer = (
+        made.selectors(length, lambda share, what: None).fine.train.windows for length in (made.length, made.longer)
+    )
+    assert {tuple(q) for q in longer.qpos.round(9)} < {tuple(q) for q in usual.qpos.round(9)}
+    assert len(longer) > 0.75 * len(usual)  # all but the last of each run
 
 
 # --- what a report depends on -----------------------------------------------------------------------------------------
