@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -13,6 +12,7 @@ import numpy as np
 from sb3_rpto.effects.actuation import FILTERS
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.engine import lean, quiet, untimed
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.world import BatchWorld, World
 
@@ -52,7 +52,7 @@ class Simulation:
     """
 
     def __init__(self, model: mujoco.MjModel, effects: Sequence[Effect], nthread: int = 0) -> None:
-        self.model = model.__copy__()
+        self.model = lean(model)
         # A simulation that blows up must show, not start anew.
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.effects = list(effects)
@@ -95,7 +95,7 @@ class Simulation:
         out_q = np.empty((n, steps + 1, self.model.nq))
         out_v = np.empty((n, steps + 1, self.model.nv))
         out_q[:, 0], out_v[:, 0] = qpos, qvel
-        with quiet():
+        with quiet(), untimed():
             if self.model.na or self.model.nhistory:
                 # Declared filters may remember for longer than the model's own.
                 slow = [float(x.max()) for e, x in active if isinstance(e, Declared) and e.number[2] == "timeconst"]
@@ -198,18 +198,6 @@ class Simulation:
 
 
 Active = Sequence[tuple[Effect, np.ndarray]]
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep MuJoCo from printing a line for every simulation that became unstable: NaN says so."""
-    usual, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-    silent.logto_console = silent.logto_file = False
-    silent.set()
-    try:
-        yield
-    finally:
-        usual.set()
 
 
 def prepare(world: World, active: Active) -> None:

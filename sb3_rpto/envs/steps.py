@@ -8,7 +8,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.simulation import quiet
+from sb3_rpto.effects.engine import quiet
 from sb3_rpto.envs.state import copy_env
 
 #: Episodes whose first step is compared with MuJoCo alone.
