@@ -66,7 +66,7 @@ class Simulation:
         #: (p,) False for parameters of shape, which do nothing by themselves
         self.strength = np.array([not p.shape for e in self.effects for p in e.parameters], dtype=bool)
         self._settings: dict[str, Declared] = {}
-        self._worlds: dict[int, BatchWorld] = {}
+        self._worlds: dict[tuple[int, ...], BatchWorld] = {}
 
     def values(self) -> np.ndarray:
         """The effects' own values, (p,)."""
@@ -86,12 +86,12 @@ class Simulation:
         """
         n, total, _ = drive.commands.shape
         steps = total - drive.before
-        world = self._world(n)
-        active = self.active(values)
+        known, active = self.from_settings(drive.settings), self.active(values)
         commands = filter_commands(active, drive.commands, self.model.opt.timestep)
+        world = self._world(n, [*known, *active])
         world.restore()
         world.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        prepare(world, [*self.from_settings(drive.settings), *active])
+        prepare(world, [*known, *active])
         out_q = np.empty((n, steps + 1, self.model.nq))
         out_v = np.empty((n, steps + 1, self.model.nv))
         out_q[:, 0], out_v[:, 0] = qpos, qvel
@@ -182,12 +182,14 @@ class Simulation:
             world.qpos[:], world.qvel[:], world.ctrl[:] = qpos, qvel, past[:, k]
             world.batch.step()
 
-    def _world(self, n: int) -> BatchWorld:
-        if n not in self._worlds:
+    def _world(self, n: int, active: Active) -> BatchWorld:
+        """One of the last few batches, or a new one: a field once written is copied in every step from then on."""
+        key = (n, *(id(effect) for effect, _ in active))
+        if key not in self._worlds:
             if len(self._worlds) >= 4:
                 self._worlds.pop(next(iter(self._worlds)))
-            self._worlds[n] = BatchWorld(self.model, n, self.nthread)
-        return self._worlds[n]
+            self._worlds[key] = BatchWorld(self.model, n, self.nthread)
+        return self._worlds[key]
 
     def from_settings(self, settings: Mapping[str, np.ndarray]) -> Active:
         """Parameters that are known of each simulation, by declared name, (n,), as effects with their values."""

@@ -163,32 +163,36 @@ class Problem:
         return np.where(values + step > self.upper, -step, step)
 
     def linearise(
-        self, values: np.ndarray, starts: np.ndarray, free: np.ndarray
+        self, values: np.ndarray, starts: np.ndarray, free: np.ndarray, base: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residuals and their derivatives by the free parameters (in plausible sizes) and by the start.
 
         :param values: (p,), or (W, p) for parameters of its own in each window (then none may be free)
         :param starts: (W, 2 nv)
         :param free: (f,) indices
+        :param base: the residuals, (W, R), where they are known from before
         :return: (W, R), (W, R, f), (W, R, x)
         """
         count, f, x = len(self.windows), len(free), len(self.moving)
-        columns, p = 1 + f + x, values.shape[-1]
+        if self.simulation.model.na:
+            base = None  # how long filters are led depends on what is simulated beside
+        columns, p = f + x + (base is None), values.shape[-1]
         all_values = np.tile(np.broadcast_to(values, (count, p)), (columns, 1, 1))
         all_starts = np.tile(starts, (columns, 1, 1))
         step = self.steps(values)[free] if f else np.empty(0)
         for i, parameter in enumerate(free):
-            all_values[1 + i, :, parameter] += step[i]
+            all_values[i, :, parameter] += step[i]
         for i, coordinate in enumerate(self.moving):
-            all_starts[1 + f + i, :, coordinate] += 0.3
+            all_starts[f + i, :, coordinate] += 0.3
         index = np.tile(np.arange(count), columns)
         r = self.residuals(all_values.reshape(columns * count, p), all_starts.reshape(columns * count, -1), index)
         r = r.reshape(columns, count, -1)
-        by_values = (r[1 : 1 + f] - r[0]) * (self.size[free] / step)[:, None, None]
-        by_start = (r[1 + f :] - r[0]) / 0.3
+        base = r[-1] if base is None else base
+        by_values = (r[:f] - base) * (self.size[free] / step)[:, None, None]
+        by_start = (r[f : f + x] - base) / 0.3
         # A difference across a simulation that blew up says nothing.
         by_values, by_start = (np.where(np.abs(d) < 0.5 * UNSTABLE, d, 0.0) for d in (by_values, by_start))
-        return r[0], by_values.transpose(1, 2, 0), by_start.transpose(1, 2, 0)
+        return base, by_values.transpose(1, 2, 0), by_start.transpose(1, 2, 0)
 
     # --- fits ---------------------------------------------------------------------------------------------------
 
@@ -235,10 +239,11 @@ class Problem:
         :return: never worse than where it began, if that is within the bounds
         """
         values, damping, linear = values.copy(), 1e-3, None
+        r: np.ndarray | None = None
         values[free] = np.clip(values[free], self.lower[free], self.upper[free])
         starts = np.zeros((len(self.windows), 2 * self.simulation.model.nv)) if starts is None else starts.copy()
         for _ in range(iterations):
-            r, jt, jx = self.linearise(values, starts, free)
+            r, jt, jx = self.linearise(values, starts, free, r)
             loss = Loss.of(r)
             now = float(self.cost(r, starts, values, loss))
             reduced = self.reduce(r, jt, jx, starts, loss)
@@ -253,6 +258,7 @@ class Problem:
                 damping = float(np.clip(step.damping, 1e-6, 1e6))
             if slow or now - step.cost < tolerance * now:
                 break
+        assert r is not None  # there is an iteration
         return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, Loss.of(r))), linear)
 
     def _slow(self, loss: Loss, before: tuple[np.ndarray, np.ndarray], step: _Step, now: float, share: float) -> bool:
@@ -361,9 +367,9 @@ class Problem:
         count, none = len(self.windows), np.empty(0, dtype=int)
         starts = np.zeros((count, 2 * self.simulation.model.nv)) if starts is None else starts.copy()
         rows = np.broadcast_to(values, (count, values.shape[-1]))
-        best = self.residuals(rows, starts, np.arange(count))
+        best = None
         for _ in range(iterations if len(self.moving) else 0):
-            r, jt, jx = self.linearise(values, starts, none)
+            r, jt, jx = self.linearise(values, starts, none, best)
             loss = Loss.of(r)
             trial = starts.copy()
             trial[:, self.moving] -= self.reduce(r, jt, jx, starts, loss).move
@@ -371,6 +377,7 @@ class Problem:
             better = loss.energy(now, trial) < loss.energy(r, starts)
             starts = np.where(better[:, None], trial, starts)
             best = np.where(better[:, None], now, r)
+        best = self.residuals(rows, starts, np.arange(count)) if best is None else best
         return Fit(values, starts, self.errors(best), float(Loss.of(best).energy(best, starts).sum()))
 
     def redrawn(self, fit: Fit, rng: np.random.Generator) -> Problem:

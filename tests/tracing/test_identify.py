@@ -185,6 +185,21 @@ def test_derivatives_are_differences_of_residuals() -> None:
     assert scale > 1
 
 
+@pytest.mark.parametrize("free", [[], [1, 0]])
+def test_residuals_that_are_known_are_not_simulated_again(free, monkeypatch) -> None:
+    p = declared_problem()
+    count = len(p.windows)
+    values, starts = np.array([0.06, 0.55]), 0.1 * np.random.default_rng(0).standard_normal((count, 2))
+    base = p.residuals(np.tile(values, (count, 1)), starts, np.arange(count))
+    expected = p.linearise(values, starts, np.array(free, dtype=int))
+    simulated = []
+    predict = p.predict
+    monkeypatch.setattr(p, "predict", lambda *a: (simulated.append(len(a[2])), predict(*a))[1])
+    for one, other in zip(p.linearise(values, starts, np.array(free, dtype=int), base), expected):
+        np.testing.assert_array_equal(one, other)
+    assert simulated == [count * (len(free) + 2)]
+
+
 def test_the_derivative_at_a_bound_points_inside() -> None:
     p = problem(declare(compiled(), ["pole.mass=0.2:0.5"]), recorded(true_effects()))
     assert p.steps(np.array([0.5]))[0] < 0
