@@ -124,6 +124,12 @@ def test_a_case_becomes_a_row_and_a_line_of_the_table(monkeypatch):
     assert "| 3.00 [2.00, 4.00] | 38% | 2.2, 60% | no |" in text
 
 
+def test_the_tracers_steps_are_those_of_the_plain_batch():
+    ours, plain = (cases.substeps(5, 50).variants[name]() for name in ("ours", "MuJoCo's batch"))
+    np.testing.assert_array_equal(ours, plain)
+    assert np.ptp(ours) > 1
+
+
 def test_the_command_writes_figures_and_manifest(tmp_path, monkeypatch):
     monkeypatch.setattr(speed, "_cases", lambda *_: [cases.columns(2)])
     monkeypatch.setattr(

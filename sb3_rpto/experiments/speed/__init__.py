@@ -96,6 +96,7 @@ def _cases(scale: str, device: str) -> list[Case]:
         cases.rollouts(device, 10_000 if small else 100_000),
         cases.whole_loop(device, 30 if small else 100, 50 if small else 200),
         cases.columns(50 if small else 400),
+        cases.substeps(100 if small else 2_000, 200),
     ]
 
 

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from mujoco.batch import Batch
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import configure
 
@@ -23,7 +24,9 @@ from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
 from sb3_rpto.dynamics.products import fast_products
 from sb3_rpto.effects import Simulation, declare
+from sb3_rpto.effects.friction import AsymmetricDamping
 from sb3_rpto.effects.simulation import Drive
+from sb3_rpto.experiments.planting.systems import SYSTEMS
 from sb3_rpto.experiments.speed.plain import PlainEnsemble, PlainRPTO
 from sb3_rpto.experiments.speed.timing import Variants
 
@@ -242,6 +245,35 @@ def columns(transitions: int) -> Case:
 
     variants = {"a compilation a column": one_by_one, "ours": batched}
     return Case("columns of the fit", "ms", 1, variants, "a compilation a column")
+
+
+def substeps(windows: int, steps: int) -> Case:
+    """Simulations of the tracer in which an effect acts in every substep, against a batch of the model as it is."""
+    model = mujoco.MjModel.from_xml_string(SYSTEMS["double_pendulum"].xml)
+    model.dof_frictionloss[:] = 0.05
+    effect = AsymmetricDamping("shoulder", forward=0.02, backward=0.05)
+    rng = np.random.default_rng(0)
+    qpos, qvel = rng.normal(0, 0.5, (windows, model.nq)), rng.normal(0, 2, (windows, model.nv))
+    commands = np.repeat(rng.uniform(-1, 1, (windows, 1, model.nu)), steps, axis=1)
+    simulation, batch = Simulation(model, [effect]), Batch(model, windows, 0)
+    q, v, ctrl, force = (batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qfrc_applied"))
+
+    def lean() -> np.ndarray:
+        return simulation.rollout(np.tile(effect.values, (windows, 1)), qpos, qvel, Drive(commands))[0]
+
+    def plain() -> np.ndarray:
+        out = np.empty((windows, steps + 1, model.nq))
+        batch.reset()
+        q[:], v[:], out[:, 0] = qpos, qvel, qpos
+        forward, backward = effect.values
+        for k in range(steps):
+            ctrl[:] = commands[:, k]
+            force[:, 0] = -forward * np.maximum(v[:, 0], 0) - backward * np.minimum(v[:, 0], 0)
+            batch.step()
+            out[:, k + 1] = q
+        return out
+
+    return Case("steps of the tracer", "ms", 1, {"MuJoCo's batch": plain, "ours": lean}, "MuJoCo's batch")
 
 
 def _ensemble(cls: type[EnsembleDynamics], device: str, members: int = 7) -> EnsembleDynamics:
