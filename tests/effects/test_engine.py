@@ -15,12 +15,8 @@ TASKS = ("HalfCheetah-v5", "Hopper-v5", "InvertedDoublePendulum-v5", "Swimmer-v5
 ISLAND, CONTACT = (int(flag) for flag in (mujoco.mjtDisableBit.mjDSBL_ISLAND, mujoco.mjtDisableBit.mjDSBL_CONTACT))
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.parametrize("task", TASKS)
-def test_lean_steps_are_the_models_own_to_the_last_bit(task, friction):
-    """With contacts, limits and dry friction, under random commands, against a batch of the model as it is."""
-    model = gym.make(task).unwrapped.model
-    model.dof_frictionloss[:] = friction
+def assert_same_steps(model):
+    """A rollout as a batch of the model as it is makes it, under random commands."""
     rng = np.random.default_rng(0)
     n, steps = 8, 60
     qpos = model.qpos0 + 0.05 * rng.standard_normal((n, model.nq))
@@ -32,6 +28,27 @@ def test_lean_steps_are_the_models_own_to_the_last_bit(task, friction):
     q, v = Simulation(model, [], 1).rollout(np.empty((n, 0)), qpos, qvel, Drive(commands))
     np.testing.assert_array_equal(q[:, 1:], plain["qpos"])
     np.testing.assert_array_equal(v[:, 1:], plain["qvel"])
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize("task", TASKS)
+def test_lean_steps_are_the_models_own_to_the_last_bit(task, friction):
+    """With contacts, limits and dry friction."""
+    model = gym.make(task).unwrapped.model
+    model.dof_frictionloss[:] = friction
+    assert_same_steps(model)
+
+
+@pytest.mark.parametrize("integrator", mujoco.mjtIntegrator.__members__.values())
+@pytest.mark.parametrize("cone", mujoco.mjtCone.__members__.values())
+@pytest.mark.parametrize("solver", mujoco.mjtSolver.__members__.values())
+def test_so_they_are_whatever_the_model_is_solved_with(solver, cone, integrator):
+    """Sliding contacts are solved once more, too."""
+    model = gym.make("Hopper-v5").unwrapped.model
+    model.dof_frictionloss[:] = 0.2
+    model.opt.solver, model.opt.cone, model.opt.integrator = int(solver), int(cone), int(integrator)
+    model.opt.noslip_iterations = 3
+    assert_same_steps(model)
 
 
 @pytest.mark.parametrize(
