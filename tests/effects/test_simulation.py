@@ -119,6 +119,17 @@ def test_settings_differ_by_simulation() -> None:
         np.testing.assert_array_equal(got[0][i], expected[0][0])
 
 
+def test_an_effect_at_rest_leaves_nothing_behind_to_copy_in_every_step() -> None:
+    simulation = Simulation(MODEL, [LIBRARY["viscous_friction"]("shoulder"), LIBRARY["armature"]("elbow")], 1)
+    qpos, qvel, commands = start(3, 5)
+    expanded = []
+    for viscous, armature in ((0.1, 0.0), (0.0, 0.01), (0.0, 0.0)):
+        simulation.rollout(np.tile([viscous, armature], (3, 1)), qpos, qvel, Drive(commands))
+        batch = list(simulation._worlds.values())[-1].batch
+        expanded.append([name for name in ("dof_damping", "dof_armature") if batch.expanded(name) is not None])
+    assert expanded == [["dof_damping"], ["dof_armature"], []]
+
+
 def test_actuators_that_are_off_do_nothing() -> None:
     qpos, qvel, commands = start(3, 80)
     sim = Simulation(MODEL, [], 1)
