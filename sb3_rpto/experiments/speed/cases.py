@@ -221,7 +221,7 @@ def columns(transitions: int) -> Case:
     model, skip = env.unwrapped.model, env.unwrapped.frame_skip  # type: ignore[attr-defined]
     spec = mujoco.MjSpec.from_file(env.unwrapped.fullpath)  # type: ignore[attr-defined]
     effects = declare(model, LENGTHS)
-    simulation = Simulation(model, effects)
+    simulation = Simulation(model, effects, th.get_num_threads())
     rng = np.random.default_rng(0)
     qpos = model.qpos0 + rng.normal(0, 0.1, (transitions, model.nq))
     qvel = rng.normal(0, 1, (transitions, model.nv))
@@ -255,10 +255,11 @@ def substeps(windows: int, steps: int) -> Case:
     rng = np.random.default_rng(0)
     qpos, qvel = rng.normal(0, 0.5, (windows, model.nq)), rng.normal(0, 2, (windows, model.nv))
     commands = np.repeat(rng.uniform(-1, 1, (windows, 1, model.nu)), steps, axis=1)
-    simulation, batch = Simulation(model, [effect]), Batch(model, windows, 0)
+    threads = th.get_num_threads()
+    simulation, batch = Simulation(model, [effect], threads), Batch(model, windows, threads)
     q, v, ctrl, force = (batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qfrc_applied"))
 
-    def lean() -> np.ndarray:
+    def ours() -> np.ndarray:
         return simulation.rollout(np.tile(effect.values, (windows, 1)), qpos, qvel, Drive(commands))[0]
 
     def plain() -> np.ndarray:
@@ -273,7 +274,7 @@ def substeps(windows: int, steps: int) -> Case:
             out[:, k + 1] = q
         return out
 
-    return Case("steps of the tracer", "ms", 1, {"MuJoCo's batch": plain, "ours": lean}, "MuJoCo's batch")
+    return Case("steps of the tracer", "ms", 1, {"MuJoCo's batch": plain, "ours": ours}, "MuJoCo's batch")
 
 
 def _ensemble(cls: type[EnsembleDynamics], device: str, members: int = 7) -> EnsembleDynamics:
