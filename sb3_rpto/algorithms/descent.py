@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch as th
@@ -27,7 +28,10 @@ class Descent:
 
     def __call__(self, loss: th.Tensor) -> None:
         """One step down the gradient of ``loss``."""
-        gradients = th.autograd.grad(loss, self.parameters, allow_unused=True)
+        self.step(th.autograd.grad(loss, self.parameters, allow_unused=True))
+
+    def step(self, gradients: Sequence[th.Tensor | None]) -> None:
+        """One step down gradients that are known, one for each parameter in the optimizer's order."""
         begun = len(self.optimizer.state) == len(self.parameters)  # the first step makes the state
         if self._plain and begun and all(gradient is not None for gradient in gradients):
             self._step_adam(list(gradients))

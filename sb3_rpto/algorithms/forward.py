@@ -10,7 +10,7 @@ from stable_baselines3.common.distributions import SquashedDiagGaussianDistribut
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.sac.policies import Actor
 
-_HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
+HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
 
 def sample_actions(actor: Actor, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -32,7 +32,7 @@ def sample_actions(actor: Actor, observations: th.Tensor) -> tuple[th.Tensor, th
     noise = th.randn_like(mean)
     actions = th.tanh(mean + log_std.exp() * noise)
     terms = 0.5 * noise.square() + log_std + (1.0 - actions.square() + distribution.epsilon).log()
-    return actions, -(terms.sum(dim=1, keepdim=True) + actions.shape[1] * _HALF_LOG_TWO_PI)
+    return actions, -(terms.sum(dim=1, keepdim=True) + actions.shape[1] * HALF_LOG_TWO_PI)
 
 
 def smallest_q(critic: ContinuousCritic, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:

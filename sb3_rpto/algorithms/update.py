@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from sb3_rpto.algorithms.descent import Descent, Follower
 from sb3_rpto.algorithms.forward import sample_actions, smallest_q
+from sb3_rpto.algorithms.written import WrittenUpdate, are_usual
 from sb3_rpto.buffers import DualReplayBuffer, World, chronological
 from sb3_rpto.dynamics.base import Dynamics, Transitions
 from sb3_rpto.dynamics.products import fast_products
@@ -87,13 +88,14 @@ class RelativeUpdate(SAC):
         self._update_learning_rate(optimizers)
         descents = Descents(*(Descent(optimizer) for optimizer in optimizers))
         follow = Follower(self.critic_target, self.critic, self.tau)
+        update = WrittenUpdate(self) if self._is_sacs() and are_usual(self) else self.update_once
         losses: dict[str, list[th.Tensor]] = {}
         with fast_products(self.device):
             burst = max(1, GATHERED // batch_size)
             for first in range(0, gradient_steps, burst):
                 batches = self.sample_batches(min(burst, gradient_steps - first), batch_size)
                 for step, (critic_batch, actor_batch) in enumerate(batches, first):
-                    for name, loss in self.update_once(critic_batch, actor_batch, descents).items():
+                    for name, loss in update(critic_batch, actor_batch, descents).items():
                         losses.setdefault(name, []).append(loss.detach().reshape(()))
                     if step % self.target_update_interval == 0:
                         follow()
@@ -102,6 +104,11 @@ class RelativeUpdate(SAC):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in losses.items():  # read here at once: reading each would wait for the device every step
             self.logger.record(f"train/{name}", float(np.mean(th.stack(values).tolist())))
+
+    def _is_sacs(self) -> bool:
+        """Whether no subclass has losses of its own, which autograd would have to differentiate."""
+        own, names = type(self), ("update_once", "critic_loss", "actor_loss", "temperature_loss")
+        return all(getattr(own, name) is getattr(RelativeUpdate, name) for name in names)
 
     def update_once(
         self, critic_batch: ReplayBufferSamples, actor_batch: ReplayBufferSamples, descend: Descents
