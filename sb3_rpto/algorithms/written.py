@@ -86,7 +86,6 @@ class Sample(NamedTuple):
     spread: th.Tensor  # sigma z
     room: th.Tensor  # 1 - a^2, the slope of tanh
     free: th.Tensor  # whether log sigma is within SB3's bounds
-    epsilon: float  # SB3's, in log(1 - a^2 + epsilon)
 
 
 class WrittenUpdate:
@@ -99,8 +98,9 @@ class WrittenUpdate:
         self.model = model
         actor = model.actor
         self.actor = Chain(_linears(actor.latent_pi))
-        self.mean, self.log_std = actor.mu, actor.log_std
-        self.epsilon: float = actor.action_dist.epsilon  # type: ignore[union-attr]
+        self.mean: nn.Linear = actor.mu  # type: ignore[assignment]
+        self.log_std: nn.Linear = actor.log_std  # type: ignore[assignment]
+        self.epsilon: float = actor.action_dist.epsilon
         self.critics, self.targets = _critics(model.critic), _critics(model.critic_target)
 
     def __call__(
@@ -115,14 +115,14 @@ class WrittenUpdate:
         if learns:  # the actor is the same for both batches: it is asked once
             states.insert(0, actor_batch.observations)
         seen, sample = self._act(states)
-        following = [values[-n:] for values in (sample.actions, sample.log_prob)]
+        next_actions, next_log_prob = sample.actions[-n:], sample.log_prob[-n:]
         if learns:
             m = len(actor_batch.observations)
-            seen, sample = [answer[:m] for answer in seen], Sample(*(part[:m] for part in sample[:-1]), sample.epsilon)
+            seen, sample = [answer[:m] for answer in seen], Sample(*(part[:m] for part in sample))
             if descend.ent_coef is not None:
                 losses["ent_coef_loss"], slope = self._temperature_loss(sample.log_prob)
                 descend.ent_coef.step([slope])
-        losses["critic_loss"], gradients = self._critic_loss(critic_batch, *following, ent_coef)
+        losses["critic_loss"], gradients = self._critic_loss(critic_batch, next_actions, next_log_prob, ent_coef)
         descend.critic.step(gradients)
         if learns:
             losses["actor_loss"], gradients = self._actor_loss(seen, sample, ent_coef)
@@ -141,7 +141,7 @@ class WrittenUpdate:
         room = 1.0 - actions.square()
         terms = 0.5 * noise.square() + log_std + (room + self.epsilon).log()
         log_prob = -(terms.sum(dim=1, keepdim=True) + actions.shape[1] * HALF_LOG_TWO_PI)
-        return seen, Sample(actions, log_prob, spread, room, log_std == raw, self.epsilon)
+        return seen, Sample(actions, log_prob, spread, room, log_std == raw)
 
     def _heads(self, answer: th.Tensor) -> Sequence[th.Tensor]:
         weight = th.cat([self.mean.weight, self.log_std.weight])
@@ -185,7 +185,7 @@ class WrittenUpdate:
         smallest, which = th.stack([q.values(answer) for q, answer in zip(self.critics, answers)]).min(0)
         loss = (ent_coef * sample.log_prob[:, 0] - smallest).mean()
         # d log pi / d a = 2 a / (1 - a^2 + epsilon); d Q / d a through the critic that is the smallest in its row
-        slope = ent_coef / n * (2.0 * sample.actions / (sample.room + sample.epsilon))
+        slope = ent_coef / n * (2.0 * sample.actions / (sample.room + self.epsilon))
         for i, (q, answer) in enumerate(zip(self.critics, answers)):
             *_, first = q.chain.backward(answer, q.slope((which == i) / -n))
             slope += first @ q.chain.weights[0][:, d:]
@@ -210,22 +210,23 @@ def are_usual(model: RelativeUpdate) -> bool:
     hooks = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
     if any(type(module) not in known or any(getattr(module, hook) for hook in hooks) for module in modules):
         return False
+    heads = [actor.mu, actor.log_std]
+    if any(not isinstance(head, nn.Linear) for head in heads):
+        return False
     chains = [(actor.latent_pi, 0), *((network, 1) for critic in critics for network in critic.q_networks)]
     if not all(_is_chain(chain, end) for chain, end in chains):
         return False
-    heads: list[nn.Linear] = [actor.mu, actor.log_std]  # type: ignore[list-item]
-    own = [p for layer in (*_linears(actor.latent_pi), *heads) for p in (layer.weight, layer.bias)]
+    own = [p for layer in (actor.latent_pi, *heads) for p in layer.parameters()]
     theirs = [p for network in model.critic.q_networks for p in network.parameters()]
-    return _learns(actor.optimizer, own) and _learns(model.critic.optimizer, theirs)
+    biased = all(layer.bias is not None for layer in modules if isinstance(layer, nn.Linear))
+    return biased and _learns(actor.optimizer, own) and _learns(model.critic.optimizer, theirs)
 
 
 def _is_chain(layers: nn.Module, end: int) -> bool:
-    """Whether Linear and ReLU take turns, with ``end`` more of the first at the end, all with a bias."""
+    """Whether Linear and ReLU take turns, at least once, with ``end`` more of the first at the end."""
     kinds = [type(layer) for layer in layers.children()]
     n = len(kinds) // 2
-    return n > 0 and kinds == [nn.Linear, nn.ReLU] * n + [nn.Linear] * end and all(
-        layer.bias is not None for layer in _linears(layers)
-    )
+    return n > 0 and kinds == [nn.Linear, nn.ReLU] * n + [nn.Linear] * end
 
 
 def _learns(optimizer: th.optim.Optimizer, parameters: list[nn.Parameter]) -> bool:

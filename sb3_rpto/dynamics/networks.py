@@ -12,7 +12,7 @@ from torch import nn
 from torch.nn import functional
 
 #: rows a member computes at once: activations stay in the cache
-CHUNK = 512
+CHUNK = 256
 #: weight of the penalty that pulls the log-variance bounds together (PETS)
 BOUND_PENALTY = 0.01
 
