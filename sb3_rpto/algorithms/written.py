@@ -23,8 +23,6 @@ from sb3_rpto.algorithms.forward import HALF_LOG_TWO_PI
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.update import Descents, RelativeUpdate
 
-relu_backward = th.ops.aten.threshold_backward
-
 
 class Chain:
     """Linear layers, each followed by a ReLU.
@@ -50,7 +48,7 @@ class Chain:
         :param slope: (n, width of the last layer)
         """
         for layer in reversed(range(len(self.weights))):
-            slope = relu_backward(slope, seen[layer + 1], 0)
+            slope = slope * seen[layer + 1].sign()  # of what a ReLU answers, its slope
             yield slope
             if layer:
                 slope = slope @ self.weights[layer]
