@@ -339,12 +339,14 @@ class EnsembleDynamics(Dynamics):
         n_slots = math.ceil(n / self.n_elites) * self.n_elites
         # slots beyond n compute some row again and are dropped, so that even a single row gets a random elite
         order = th.randperm(n_slots, generator=self.generator, device=self.device)
-        heads = self.networks(inputs[order % max(n, 1)].view(self.n_elites, -1, inputs.shape[1]), self.elites)
-        slot = order.argsort()[:n]
-        mean, log_variance, logit = (output.flatten(0, 1)[slot] for output in heads)
+        dealt = inputs[order % max(n, 1)].view(self.n_elites, -1, inputs.shape[1])
+        mean, log_variance, logit = self.networks(dealt, self.elites)
         noise = th.empty_like(mean).normal_(generator=self.generator)
         chance = th.empty_like(logit).uniform_(generator=self.generator)
-        return mean + (0.5 * log_variance).exp() * noise, logit.sigmoid() > chance
+        drawn = mean + (0.5 * log_variance).exp() * noise, logit.sigmoid() > chance
+        slot = order.argsort()[:n]
+        targets, ended = (part.flatten(0, 1)[slot] for part in drawn)
+        return targets, ended
 
     def _ask_elites(self, inputs: th.Tensor) -> Heads:
         return self.networks(inputs.expand(self.n_elites, -1, -1), self.elites)

@@ -73,15 +73,21 @@ class StackedNetworks(nn.Module):
         def of(parameter: th.Tensor) -> th.Tensor:
             return parameter if members is None else parameter[members]
 
-        *hidden, (last_weight, last_bias) = [(of(w), of(b)) for w, b in zip(self.weights, self.biases)]
-        chunks = []
-        for x in inputs.split(CHUNK, dim=1):
-            for weight, bias in hidden:
-                x = functional.silu(th.baddbmm(bias, x, weight))
-            chunks.append(th.baddbmm(last_bias, x, last_weight))
-        outputs = chunks[0] if len(chunks) == 1 else th.cat(chunks, dim=1)
+        layers = [(of(w), of(b)) for w, b in zip(self.weights, self.biases)]
+        bounds = of(self.min_log_variance), of(self.max_log_variance)
+        chunks = [self._predict(layers, bounds, x) for x in inputs.split(CHUNK, dim=1)]
+        return chunks[0] if len(chunks) == 1 else Heads(*(th.cat(parts, dim=1) for parts in zip(*chunks)))
+
+    def _predict(
+        self, layers: Sequence[tuple[th.Tensor, th.Tensor]], bounds: tuple[th.Tensor, th.Tensor], x: th.Tensor
+    ) -> Heads:
+        """Of rows that fit the cache, (m, n, n_inputs)."""
+        *hidden, (last_weight, last_bias) = layers
+        for weight, bias in hidden:
+            x = functional.silu(th.baddbmm(bias, x, weight))
+        outputs = th.baddbmm(last_bias, x, last_weight)
         mean, log_variance, logit = outputs.split([self.n_targets, self.n_targets, self.n_logits], dim=-1)
-        low, high = of(self.min_log_variance), of(self.max_log_variance)
+        low, high = bounds
         log_variance = high - functional.softplus(high - log_variance)
         log_variance = low + functional.softplus(log_variance - low)
         return Heads(mean, log_variance, logit)
