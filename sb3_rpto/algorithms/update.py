@@ -106,9 +106,9 @@ class RelativeUpdate(SAC):
             self.logger.record(f"train/{name}", float(np.mean(th.stack(values).tolist())))
 
     def _is_sacs(self) -> bool:
-        """Whether no subclass has losses of its own, which autograd would have to differentiate."""
-        own, names = type(self), ("update_once", "critic_loss", "actor_loss", "temperature_loss")
-        return all(getattr(own, name) is getattr(RelativeUpdate, name) for name in names)
+        """Whether the losses are these and nobody's own, which autograd would have to differentiate."""
+        names = ("update_once", "critic_loss", "actor_loss", "temperature_loss")
+        return all(getattr(getattr(self, n), "__func__", None) is getattr(RelativeUpdate, n) for n in names)
 
     def update_once(
         self, critic_batch: ReplayBufferSamples, actor_batch: ReplayBufferSamples, descend: Descents

@@ -1,7 +1,7 @@
 """SAC's losses and their gradients written out for SB3's usual networks: autograd's numbers in fewer operations.
 
-What autograd records, walks and allocates takes as long on a CPU as half of the products of an update. For chains of
-Linear and ReLU the gradients are a few lines, so they are written here; other networks go through autograd.
+For chains of Linear and ReLU the gradients are a few lines, so they are written here; other networks go through
+autograd. What it saves on a CPU: docs/speed.md.
 """
 
 from __future__ import annotations

@@ -126,3 +126,10 @@ def test_losses_of_a_subclass_are_what_is_descended(name):
     model = small(type("Own", (RPO,), {name: own}))
     model.learn(64, source_timesteps=0)
     assert len(asked) == model._n_updates > 0
+
+
+def test_losses_put_in_place_of_a_models_are_what_is_descended(monkeypatch):
+    model, asked = small(RPO), []
+    monkeypatch.setattr(model, "critic_loss", lambda *given: (asked.append(1), RPO.critic_loss(model, *given))[1])
+    model.learn(64, source_timesteps=0)
+    assert len(asked) == model._n_updates > 0
