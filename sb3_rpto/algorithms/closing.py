@@ -349,8 +349,8 @@ def window(measured: Measurements, contacts: float) -> int:
     """Number of samples in the windows of a trace of transitions with so many ``contacts`` that change a second."""
     if measured.exact or contacts > OFTEN:
         return WINDOW
-    ends = [np.flatnonzero(~np.concatenate([[False], episode.usable, [False]])) for episode in measured.episodes]
-    stretches = np.concatenate([np.diff(end) - 1 for end in ends])  # of samples whose states are known
+    ends = [np.flatnonzero(~np.concatenate([[False], episode.placed, [False]])) for episode in measured.episodes]
+    stretches = np.concatenate([np.diff(end) - 1 for end in ends])  # of samples whose positions are known
     usual = int(np.quantile(stretches[stretches > 0], SHORT_STRETCHES)) if stretches.any() else 0
     return min(max(usual, WINDOW), NOISY_WINDOW)
 

@@ -41,7 +41,9 @@ class Episode:
     :param part: ``"train"``, ``"select"`` or ``"test"`` where the file says so
     :param usable: False where the state is not known, shape (T,); all True by default
     :param after_gap: whether it begins where samples are missing, so that the commands before it are not known
-    :raises ValueError: ``usable`` does not fit ``time``
+    :param placed: False where the positions are not known, shape (T,): predictions are not compared there, while none
+        begins where ``usable`` is False; the latter by default
+    :raises ValueError: ``usable`` or ``placed`` does not fit ``time``
     """
 
     name: str
@@ -56,14 +58,18 @@ class Episode:
     part: str | None = None
     usable: np.ndarray = None  # type: ignore[assignment]
     after_gap: bool = False
+    placed: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         if self.usable is None:
             object.__setattr__(self, "usable", np.ones(len(self.time), dtype=bool))
-        if self.usable.shape != (len(self.time),):
-            raise ValueError(
-                f"{self.name}: usable has shape {self.usable.shape}, time {self.time.shape}; cut both in the same way"
-            )
+        if self.placed is None:
+            object.__setattr__(self, "placed", self.usable)
+        for name, flags in (("usable", self.usable), ("placed", self.placed)):
+            if flags.shape != (len(self.time),):
+                raise ValueError(
+                    f"{self.name}: {name} has shape {flags.shape}, time {self.time.shape}; cut both in the same way"
+                )
 
     def __len__(self) -> int:
         return len(self.time)
@@ -205,7 +211,8 @@ def repair(run: Episode, columns: Columns, findings: list[Finding]) -> list[Epis
             findings.append(Finding("short", name, message))
             continue
         arrays = {
-            k: getattr(run, k)[rows].copy() for k in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable")
+            k: getattr(run, k)[rows].copy()
+            for k in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")
         }
         pieces.append(replace(run, name=name, after_gap=i > 0, **arrays))
         _channels(pieces[-1], columns, findings)

@@ -182,9 +182,8 @@ def build(
     if noise is not None:
         states, known_noise = behind_noise(model, recover, observations, noise)
     repairs = _Repairs(columns, states, env_name(env))
-    known = np.ones(len(states.qpos), dtype=bool)
-    for flags, seen in ((states.known_qpos, repairs.seen_qpos), (states.known_qvel, repairs.seen_qvel)):
-        known &= flags[:, seen].all(axis=1)
+    placed = states.known_qpos[:, repairs.seen_qpos].all(axis=1)
+    known = placed & states.known_qvel[:, repairs.seen_qvel].all(axis=1)
     episodes, row, action = [], 0, 0
     for run in kept:
         n = len(run.observations)
@@ -203,6 +202,7 @@ def build(
                 qfrc=np.empty((n, 0)),
                 enabled=np.ones((n, model.nu), dtype=bool),
                 usable=known[rows],
+                placed=placed[rows],
             )
         )
         row, action = row + n, action + n - 1

@@ -219,7 +219,7 @@ def cut(
             end = int(np.searchsorted(e.time, e.time[begin] + horizon + 1e-9, side="right"))
             if e.time[-1] < e.time[begin] + horizon - 1e-9 or end - begin < 3:
                 break
-            if e.usable[begin] and e.usable[begin:end].mean() > 0.5:
+            if e.usable[begin] and e.placed[begin:end].mean() > 0.5:
                 starts.append((number, begin, end))
                 follow = e.time[begin] + (1 - overlap) * (e.time[end - 1] - e.time[begin])
                 begin = max(begin + 1, int(np.searchsorted(e.time, follow - 1e-9)))
@@ -273,7 +273,7 @@ def _build(
         whole = np.round(at[w])
         at[w] = np.where(np.abs(at[w] - whole) < 1e-3, whole, at[w])
         measured[w, :n] = e.qpos[begin + 1 : end][:, observed]
-        usable[w, :n] = e.usable[begin + 1 : end]
+        usable[w, :n] = e.placed[begin + 1 : end]
         if number != last[0] or t0 - last[1] >= least - 1e-9:
             last = (number, t0)
             block[w] = block[w - 1] + 1 if w else 0

@@ -202,9 +202,9 @@ def test_transitions_that_hold_no_window_end_no_run(soon: None, monkeypatch: pyt
     assert made.loop.due(made, dynamics(made))
 
 
-def test_windows_are_as_long_as_stretches_of_known_states() -> None:
-    def seen(*usable: list[int]) -> Measurements:
-        episodes = [SimpleNamespace(usable=np.array(flags, dtype=bool)) for flags in usable]
+def test_windows_are_as_long_as_stretches_of_known_positions() -> None:
+    def seen(*placed: list[int]) -> Measurements:
+        episodes = [SimpleNamespace(placed=np.array(flags, dtype=bool)) for flags in placed]
         return SimpleNamespace(exact=False, episodes=episodes)  # type: ignore[return-value]
 
     assert closing.window(seen([1] * 20), 0.0) == closing.NOISY_WINDOW

@@ -137,7 +137,7 @@ def test_samples_that_do_not_count_do_not_count() -> None:
     for e in data.episodes:
         usable, qpos = np.ones(len(e), dtype=bool), e.qpos.copy()
         usable[7::20], qpos[7::20] = False, 1e3
-        hit.append(replace(e, usable=usable, qpos=qpos))
+        hit.append(replace(e, usable=usable, placed=usable, qpos=qpos))
     simulation = Simulation(compiled(), [], 1)
     for e in horizon_errors(simulation, simulation.null, replace(data, episodes=hit), SIGMA, 0):
         assert e.rmse[0] < 1e-9

@@ -17,7 +17,7 @@ from sb3_rpto.tracing.missing import missing_forces
 from sb3_rpto.tracing.residuals import ForceResidual, force_residuals, learnable_share, summary
 
 RATE, LEVEL = 25, 0.15  # Hz, N·m
-ARRAYS = ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable")
+ARRAYS = ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")
 
 
 def decided(planted: list[Effect], model: mujoco.MjModel | None = None) -> Measurements:

@@ -110,6 +110,7 @@ def test_samples_at_a_clip_are_not_usable():
     assert sum(c.sum() for c in clipped) > 0
     for episode, mask in zip(data.episodes, clipped):
         np.testing.assert_array_equal(episode.usable, ~mask)
+        assert episode.placed.all()  # the bound is of speeds alone
     counts = {f.where.split(".")[1]: int(f.message.split()[2]) for f in data.findings if f.kind == "clipped"}
     speeds = np.concatenate([np.array(e["qvel"]) for e in recorder.long_ones()])
     for name, count in counts.items():

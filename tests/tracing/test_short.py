@@ -52,7 +52,7 @@ def test_test_runs_too_short_to_predict_are_told() -> None:
     whole = recorded()
     parts = ["train", "train", "train", "test"]
     episodes = [replace(e, part=part) for e, part in zip(whole.episodes, parts)]
-    names = ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable")
+    names = ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")
     arrays = {name: getattr(episodes[-1], name)[:8] for name in names}
     data = replace(whole, episodes=[*episodes[:-1], replace(episodes[-1], **arrays)])
     report = briefly(PENDULUM, data, ["hinge.damping"], ["torque_offset"])

@@ -180,7 +180,7 @@ def test_no_window_begins_at_a_sample_whose_state_is_unknown_and_such_samples_do
     usable = np.ones(400, dtype=bool)
     usable[[8, 9, 60, 61]] = False
     usable[120:260] = False
-    data = replace(data, episodes=[replace(data.episodes[0], usable=usable)])
+    data = replace(data, episodes=[replace(data.episodes[0], usable=usable, placed=usable)])
     windows = cut(compiled(), data, SIGMA, 0.2, 100)
     begin = np.round(windows.qpos[:, 0] * 200).astype(int)
     assert usable[begin].all()
@@ -192,6 +192,20 @@ def test_no_window_begins_at_a_sample_whose_state_is_unknown_and_such_samples_do
         assert usable[b : rows[-1] + 1].mean() > 0.5
         count += (~ok).sum()
     assert count > 0
+
+
+def test_where_positions_alone_are_known_they_are_compared_but_no_window_begins() -> None:
+    data = ramps([clock(400)])
+    usable = np.arange(400) % 3 == 0
+    placed = np.arange(400) % 50 != 7
+    windows = cut(
+        compiled(), replace(data, episodes=[replace(data.episodes[0], usable=usable, placed=placed)]), SIGMA, 0.1, 100
+    )
+    begin = np.round(windows.qpos[:, 0] * 200).astype(int)
+    assert usable[begin].all()
+    assert len(windows) == 18  # nearly side by side, though two of three samples are no start
+    rows = np.round(windows.measured[:, :, 0] * 200).astype(int)
+    np.testing.assert_array_equal(windows.usable, placed[rows])
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4"])
