@@ -182,7 +182,7 @@ def build(
     if noise is not None:
         states, known_noise = behind_noise(model, recover, observations, noise)
     repairs = _Repairs(columns, states, env_name(env))
-    placed = states.known_qpos[:, repairs.seen_qpos].all(axis=1)
+    placed = np.asarray(states.known_qpos[:, repairs.seen_qpos].all(axis=1))
     known = placed & states.known_qvel[:, repairs.seen_qvel].all(axis=1)
     episodes, row, action = [], 0, 0
     for run in kept:

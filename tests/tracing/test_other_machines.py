@@ -196,7 +196,9 @@ def test_a_select_run_shorter_than_a_window_joins_the_training_runs() -> None:
     data = steps(machine(MOTOR), 6, 600)
     parts = ["train", "train", "train", "train", "select", "test"]
     episodes = [replace(e, part=part) for e, part in zip(data.episodes, parts)]
-    short = {n: getattr(episodes[4], n)[:80] for n in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")}
+    short = {
+        n: getattr(episodes[4], n)[:80] for n in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")
+    }
     episodes[4] = replace(episodes[4], **short)
     report = briefly(machine(MOTOR), replace(data, episodes=episodes), ["hinge.damping"], candidates=[])
     assert report.verdict == "complete"
@@ -207,7 +209,9 @@ def test_a_select_run_shorter_than_a_window_joins_the_training_runs() -> None:
 def test_a_test_run_too_short_for_inverse_dynamics_is_reported_without_a_missing_force(tmp_path) -> None:
     data = recorded(episodes=6, noise=0.0, exact=True)
     episodes = [replace(e, part="train" if i < 5 else "test") for i, e in enumerate(data.episodes)]
-    short = {n: getattr(episodes[5], n)[:4] for n in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")}
+    short = {
+        n: getattr(episodes[5], n)[:4] for n in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")
+    }
     episodes[5] = replace(episodes[5], **short)
     report = briefly(PENDULUM, replace(data, episodes=episodes), [], candidates=[])
     assert report.verdict == "complete"
