@@ -210,7 +210,8 @@ class Measurements:
         of the actuators. An episode ends at a done or a time limit, and where no transition begins at the last one's
         next observation, which is its last sample (the command there repeats the one before). Time is counted in
         ``env.unwrapped.dt``. A position that no observation holds (the x of a walker) is integrated from its velocity
-        and listed in :attr:`unobserved`; a sample with a speed at the observation's bound is not ``usable``.
+        and listed in :attr:`unobserved`; a sample with a speed at the observation's bound is not ``usable``:
+        no prediction begins there, though its positions are compared.
 
         :param buffer: of vector observations, any number of environments, raw (not normalised), actions scaled to
             [-1, 1] as SB3 stores them

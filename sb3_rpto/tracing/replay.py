@@ -209,7 +209,8 @@ def build(
     for prefix, names, flags in (("qpos", columns.qpos, states.known_qpos), ("qvel", columns.qvel, states.known_qvel)):
         for i, name in enumerate(names):
             if flags[:, i].any() and not flags[:, i].all():
-                message = f"unknown in {(~flags[:, i]).sum()} of {len(flags)} samples, which are not usable"
+                unusable = "which are not compared" if prefix == "qpos" else "where no prediction begins"
+                message = f"unknown in {(~flags[:, i]).sum()} of {len(flags)} samples, {unusable}"
                 findings.append(Finding("clipped", f"{ALL}, {prefix}.{name}", message))
     columns = replace(columns, missing=repairs.missing)
     return Measurements(
