@@ -114,8 +114,16 @@ class BatchWorld(World):
         return self.batch.expand(name)
 
     def derive(self) -> None:
-        """As in :class:`World`."""
-        self.batch.set_const()
+        """As in :class:`World`; once for all simulations whose fields are alike, as many are in a fit."""
+        written = [self._live(name).reshape(self.n, -1) for name in self._nominal if name in _DERIVING]
+        if not written:
+            return
+        _, first, kind = np.unique(np.concatenate(written, axis=1), axis=0, return_index=True, return_inverse=True)
+        self.batch.set_const(np.sort(first))
+        for name in mujoco.MjModel._setconst_outputs:
+            if self.batch.expanded(name) is not None:
+                live = self._live(name)
+                live[:] = live[first[kind.ravel()]]
 
     def evaluate(self) -> None:
         """As in :class:`World`."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.effects import LIBRARY, Drive, Effect, Simulation, declare
+from sb3_rpto.effects.world import BatchWorld
 
 XML = """
 <mujoco>
@@ -300,3 +301,24 @@ def test_other_actuators_read_no_encoder(actuator: str) -> None:
 def test_a_place_that_is_not_there_is_named() -> None:
     with pytest.raises(ValueError, match="the model has no joint 'ellbow'; did you mean 'elbow'"):
         Simulation(MODEL, [LIBRARY["viscous_friction"]("ellbow")])
+
+
+def test_constants_follow_from_the_fields_of_each_simulation_whatever_others_share_them() -> None:
+    rng, n = np.random.default_rng(3), 9
+    kinds = rng.integers(0, 4, n)
+    mass, place = rng.uniform(0.5, 2.0, (4, MODEL.nbody)), rng.normal(size=(4, MODEL.nbody, 3))
+    world = BatchWorld(MODEL, n, 1)
+    for _ in range(2):  # what was derived before does not stay
+        world.restore()
+        world.field("body_mass")[:] *= mass[kinds]
+        world.field("body_pos")[:] += place[kinds]
+        world.settle()
+        for i, kind in enumerate(kinds):
+            model = MODEL.__copy__()
+            model.body_mass[:] *= mass[kind]
+            model.body_pos[:] += place[kind]
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+            derived = world.batch.get_model(i)
+            for name in ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0"):
+                np.testing.assert_array_equal(getattr(derived, name), getattr(model, name))
+        mass, place = mass[::-1], place[::-1]
