@@ -113,6 +113,18 @@ def test_bad_input_is_one_line_that_names_the_remedy(
     assert message in error(capsys)
 
 
+def test_modules_of_ones_own_environments_are_found_where_one_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_arm.py").write_text(
+        "import gymnasium as gym\n"
+        "gym.register('own/Arm-v0', 'gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv')\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
+    assert cli._model("own_arm:own/Arm-v0").spec.id == "own/Arm-v0"
+
+
 def test_a_gymnasium_id_names_a_model() -> None:
     env = cli._model("InvertedPendulum-v5")
     assert isinstance(env.unwrapped.model, mujoco.MjModel)

@@ -212,3 +212,11 @@ def declared_rows() -> list[str]:
 
 def test_the_table_of_declared_parameters_is_what_can_be_declared():
     assert table_after("effects.md", DECLARED) == declared_rows()
+
+
+def test_every_kind_of_finding_is_in_the_table():
+    source = "\n".join(p.read_text() for p in (ROOT / "sb3_rpto" / "tracing").glob("*.py"))
+    kinds = set(re.findall(r'(?:Finding|\bsay)\(\s*"([a-z ]+)"', source))
+    assert len(kinds) > 30
+    page = (ROOT / "docs" / "measurements.md").read_text()
+    assert {kind for kind in kinds if f"`{kind}`" not in page} == set()

@@ -222,9 +222,10 @@ def resume(model: Resumable) -> None:
         restarted.append("target")
     if restarted:
         warnings.warn(
-            f"the {' and the '.join(restarted)} environment cannot restore its state: it begins a new episode, "
-            "so the resumed run differs from one that never stopped (it can where the environment is built as it was "
-            "when the checkpoint was saved, and can save its state)",
+            f"the state of the {' and the '.join(restarted)} environment cannot be restored: a new episode begins, "
+            "so the resumed run differs from one that never stopped (it can be where the environment is built as it "
+            "was when the checkpoint was saved, and is one of gymnasium's or has save_state() and "
+            "restore_state(state), see docs/checkpoints.md)",
             stacklevel=3,
         )
     if not model._reseeded:

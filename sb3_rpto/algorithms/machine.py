@@ -13,7 +13,7 @@ from sb3_rpto.dynamics.base import Dynamics, Transitions
 from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
-from sb3_rpto.effects.model import differing
+from sb3_rpto.effects.model import differing, sites_act
 from sb3_rpto.envs.observations import mujoco_model, single_env
 from sb3_rpto.tracing.columns import columns_of
 
@@ -62,7 +62,9 @@ def check_simulator(source: VecEnv, dynamics: Dynamics | None) -> None:
     """
     physical = dynamics.physical if isinstance(dynamics, ResidualDynamics) else dynamics
     if isinstance(physical, PhysicalDynamics):
-        found = differing(physical.model, mujoco_model(single_env(source)))
+        model = mujoco_model(single_env(source))
+        # Places that nothing acts at are marks, such as a goal's, which a task may move.
+        found = [n for n in differing(physical.model, model) if not n.startswith("site_") or sites_act(model)]
     elif isinstance(physical, CartPoleDynamics):
         found = [name for name, value in cartpole_constants(source).items() if value != physical.nominal[name]]
     else:

@@ -46,7 +46,10 @@ class PolicySnapshots(RelativeUpdate):
         :raises ValueError: when there is no such policy yet
         """
         if to not in self.snapshots:
-            raise ValueError(f"no policy {to!r} to roll back to; there is {sorted(self.snapshots) or 'none yet'}")
+            until = '; "simulator" is kept once a trace is complete or explained' if to == "simulator" else ""
+            raise ValueError(
+                f"no policy {to!r} to roll back to; there is {sorted(self.snapshots) or 'none yet'}{until}"
+            )
         snapshot = self.snapshots[to]
         self.snapshots.pop("learner", None)  # what goes on learning is this one
         self.policy.load_state_dict(snapshot["policy"])

@@ -11,16 +11,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.model import differing, load_model
 from sb3_rpto.effects.wrapper import beyond_model
-from sb3_rpto.envs.observations import env_name, layers, mujoco_model, single_env, state_map
-from sb3_rpto.envs.steps import odd_step
+from sb3_rpto.envs.observations import StateMap, env_name, layers, mujoco_model, single_env, state_map
+from sb3_rpto.envs.steps import odd_state, odd_step
 
 
 def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
     """What :class:`~sb3_rpto.dynamics.physical.PhysicalDynamics` must know of an environment; plain data that pickles.
 
     :param env: with all its wrappers; of a VecEnv the first
-    :raises ValueError: no MuJoCo model, states that cannot be recovered from observations, actions that are not the
-        commands of the actuators, steps that are more than their simulation, several models
+    :raises ValueError: no MuJoCo model, states that cannot be recovered from observations or are not what these are
+        read as, actions that are not the commands of the actuators, steps that are more than their simulation, several
+        models
     """
     single = single_env(env)
     model, recover = mujoco_model(single), state_map(single)
@@ -37,6 +38,7 @@ def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
     if frame_skip is None:
         raise ValueError(f"{env_name(single)} has no frame_skip; derive it from gymnasium.envs.mujoco.MujocoEnv")
     check_step(single, int(frame_skip))
+    check_states(single, recover)
     spec, _ = load_model(single)
     plain = model.__copy__() if spec is None else PlainModel.of(spec, model)  # nothing tells the MJCF of some
     return {"model": plain, "recover": recover, "frame_skip": int(frame_skip)}
@@ -95,4 +97,19 @@ def check_step(env: gym.Env, frame_skip: int) -> None:
         raise ValueError(
             f"{env_name(env)}: step() {found}, and phi would make up for what step() adds; let actions be the "
             "commands of the actuators, and forces part of the MJCF or an effect (dynamics_kwargs={'effects': [...]})"
+        )
+
+
+def check_states(env: gym.Env, recover: StateMap) -> None:
+    """Require that the states behind the observations are those of the simulation; what cannot be copied passes.
+
+    :param env: a MuJoCo environment with all its wrappers; untouched
+    :param recover: states from its observations
+    :raises ValueError: a coordinate that is another one, or in other units
+    """
+    found = odd_state(env, recover)
+    if found is not None:
+        raise ValueError(
+            f"{env_name(env)}: {found}; correct the map that register_state_map was given (order of joints, positions "
+            "before velocities, signs, radians)"
         )

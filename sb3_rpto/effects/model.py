@@ -120,6 +120,13 @@ def differing(one: mujoco.MjModel, other: mujoco.MjModel, rounded: bool = False)
     return [n for n in mine if n not in derived and not np.array_equal(mine[n], theirs[n], equal_nan=True)]
 
 
+def sites_act(model: mujoco.MjModel) -> bool:
+    """Whether the motion depends on where sites are: motors push at them, tendons or constraints hold them."""
+    at_sites = (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_SLIDERCRANK)
+    tied = (model.eq_objtype == int(mujoco.mjtObj.mjOBJ_SITE)).any()
+    return bool(model.ntendon or tied or np.isin(model.actuator_trntype, [int(t) for t in at_sites]).any())
+
+
 def _public(owner: Any) -> Iterator[tuple[str, Any]]:
     return ((name, getattr(owner, name)) for name in dir(owner) if not name.startswith("_"))
 

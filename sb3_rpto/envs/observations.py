@@ -76,11 +76,16 @@ _registered: dict[str | type[gym.Env], Callable[[gym.Env], Recover]] = {}
 def register_state_map(env: str | type[gym.Env], make: Callable[[gym.Env], Recover]) -> None:
     """Say how the states of an environment are recovered; takes precedence over what is known here.
 
-    For example, where the observation is all of the state::
+    For example, where the observation begins with the state, whatever comes after it::
 
         def make(env):
-            nq = env.unwrapped.model.nq
-            return lambda obs: States(obs[:, :nq], obs[:, nq:], obs[:, :nq] < np.inf, obs[:, nq:] < np.inf)
+            nq, nv = env.unwrapped.model.nq, env.unwrapped.model.nv
+
+            def recover(obs):
+                qpos, qvel = obs[:, :nq], obs[:, nq : nq + nv]
+                return States(qpos, qvel, np.isfinite(qpos), np.isfinite(qvel))
+
+            return recover
 
         register_state_map("mine/Arm-v0", make)
 

@@ -156,7 +156,7 @@ def _save_env(env: gym.Env) -> dict[str, Any]:
     saved: dict[str, Any] = {"kind": kind, "np_random": None}
     if kind == "own":
         layers.append(_attributes(base, ()))
-        saved["simulation"] = copy.deepcopy(base.get_state())  # type: ignore[attr-defined]
+        saved["simulation"] = copy.deepcopy(_call(base, 0))
     elif kind == "plain":
         layers.append(_attributes(base, _ENVS[type(base)]))
     else:
@@ -180,7 +180,7 @@ def _wrapper_state(layer: gym.Env) -> tuple[str, ...] | None:
 
 def _kind(base: gym.Env) -> Any:
     """How the environment's state is read; for MuJoCo also the layout of the model."""
-    if callable(getattr(base, "get_state", None)) and _takes_one(getattr(base, "set_state", None)):
+    if _own(base) is not None:
         return "own"
     if type(base) in _ENVS:
         return "plain"
@@ -189,9 +189,27 @@ def _kind(base: gym.Env) -> Any:
     raise _Unknown
 
 
+#: Pairs of methods by which an environment of one's own saves and restores its state; MujocoEnv has another set_state.
+_OWN = (("get_state", "set_state"), ("save_state", "restore_state"))
+
+
+def _own(base: gym.Env) -> tuple[str, str] | None:
+    """Names of the methods that return the state and take it."""
+    for get, put in _OWN:
+        if callable(getattr(base, get, None)) and _takes_one(getattr(base, put, None)):
+            return get, put
+    return None
+
+
 def _is_mujoco_task(base: gym.Env) -> bool:
     """Whether it is one of gymnasium's or of this package's, whose state is known."""
     return hasattr(base, "model") and type(base).__module__.startswith(("gymnasium.envs.mujoco.", "sb3_rpto.envs."))
+
+
+def _call(base: gym.Env, which: int, *args: Any) -> Any:
+    names = _own(base)
+    assert names is not None  # its kind is "own"
+    return getattr(base, names[which])(*args)
 
 
 def _takes_one(method: Any) -> bool:
@@ -210,7 +228,7 @@ def _restore_simulation(base: gym.Env, saved: dict[str, Any]) -> None:
         base._np_random.bit_generator.state = copy.deepcopy(stream)
         base._np_random_seed = seed
     if saved["kind"] == "own":
-        base.set_state(copy.deepcopy(saved["simulation"]))  # type: ignore[attr-defined]
+        _call(base, 1, copy.deepcopy(saved["simulation"]))
     elif saved["kind"] != "plain":
         import mujoco
 

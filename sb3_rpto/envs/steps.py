@@ -1,4 +1,4 @@
-"""Whether a step of a MuJoCo environment is the simulation of its action, and nothing else."""
+"""Whether a MuJoCo environment's step is the simulation of its action alone, and its observations show its states."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects.engine import quiet
+from sb3_rpto.envs.observations import StateMap
 from sb3_rpto.envs.state import copy_env
 
 #: Episodes whose first step is compared with MuJoCo alone.
 TRIED = 3
+#: Episodes and steps of each whose states are compared with what the observations are said to show.
+SHOWN, STEPS = 3, 10
+#: A coordinate is wrong where it is off by more than this share of how far the coordinate moves, and by this much.
+OFF, LEAST = 0.5, 1e-3
 
 
 def odd_step(env: gym.Env, frame_skip: int) -> str | None:
@@ -45,3 +50,43 @@ def odd_step(env: gym.Env, frame_skip: int) -> str | None:
         if not (np.allclose(base.data.qpos, alone.qpos) and np.allclose(base.data.qvel, alone.qvel)):
             return "moves otherwise than MuJoCo under the same command"
     return None
+
+
+def odd_state(env: gym.Env, recover: StateMap) -> str | None:
+    """Which coordinate the observations do not show as they are said to; None where all are, but for some noise.
+
+    A copy is stepped by random actions. Nothing is found where it cannot be copied.
+
+    :param env: a MuJoCo environment; untouched
+    :param recover: states from its observations
+    :raises ValueError: what the map returns has other shapes than states
+    """
+    twin = copy_env(env)
+    if twin is None:
+        return None
+    base: Any = twin.unwrapped
+    twin.action_space.seed(0)
+    observations, states = list[np.ndarray](), list[np.ndarray]()
+    for seed in range(SHOWN):
+        observation, _ = twin.reset(seed=seed)
+        for _ in range(STEPS):
+            observations.append(np.asarray(observation, dtype=float))
+            states.append(np.concatenate([base.data.qpos, base.data.qvel]))
+            observation, _, ended, _, _ = twin.step(twin.action_space.sample())
+            if ended:
+                break
+    shown, true = recover(np.array(observations)), np.array(states)
+    off = np.concatenate([shown.qpos, shown.qvel], axis=1) - true
+    turns = list(shown.wrapped)
+    off[:, turns] = (off[:, turns] + np.pi) % (2 * np.pi) - np.pi
+    off[~np.concatenate([shown.known_qpos, shown.known_qvel], axis=1)] = 0.0
+    wrong = np.sqrt((off**2).mean(axis=0)) > np.maximum(OFF * true.std(axis=0), LEAST)
+    if not wrong.any():
+        return None
+    column = int(np.flatnonzero(wrong)[0])
+    nq = base.model.nq
+    name = f"qpos[{column}]" if column < nq else f"qvel[{column - nq}]"
+    row = int(np.abs(off[:, column]).argmax())
+    return (
+        f"{name} is {true[row, column]:.4g} where the observation is read as {true[row, column] + off[row, column]:.4g}"
+    )

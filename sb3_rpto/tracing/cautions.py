@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 
 import mujoco
@@ -37,6 +38,8 @@ EARLY = 0.5
 WORSE = 0.05
 #: Most windows that steps in time are compared in.
 STEPPED = 40
+#: Kinds of dry friction at a joint, a level of it that makes MuJoCo's own constraint act, and iterations of the fit.
+DRY, LITTLE, SOFT_FIT = ("coulomb_friction", "stribeck_friction", "position_friction"), 1e-9, 8
 
 
 def missed(
@@ -97,12 +100,17 @@ def strays(selector: Selector, values: np.ndarray, set_up: SetUp, seed: int) -> 
     stray = errors > limit
     whole = [run for run in sorted({*runs[stray]}) if stray[runs == run].mean() > 0.5]
     groups = [(f"run {run}", runs == run) for run in whole] + [("fitted runs", ~np.isin(runs, whole))]
-    message = "{} of {} windows err far more than the others; fits give them little weight (robust loss)"
-    return [
-        Finding("stray windows", where, message.format(int(stray[rows].sum()), int(rows.sum())))
-        for where, rows in groups
-        if stray[rows].any()
-    ]
+    times = np.concatenate([problem.windows.time for problem, _ in parts])
+    found = []
+    for where, rows in groups:
+        if stray[rows].any():
+            worst = int(np.flatnonzero(rows)[errors[rows].argmax()])
+            message = (
+                f"{stray[rows].sum()} of {rows.sum()} windows err far more than the others, most the one at "
+                f"{times[worst]:.3g} s of {runs[worst]}; fits give them little weight (robust loss)"
+            )
+            found.append(Finding("stray windows", where, message))
+    return found
 
 
 def undetermined(problem: Problem, values: np.ndarray, intervals: np.ndarray) -> list[Finding]:
@@ -155,6 +163,37 @@ def early_response(found: Found, data: Measurements) -> list[Finding]:
         "each row seems to hold the command of the row before; shift the ctrl columns up a row and trace again"
     )
     return [Finding("early response", "all episodes, ctrl", message)]
+
+
+def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> list[Finding]:
+    """Whether dry friction, named or known, would leave less as MuJoCo's own, which creeps where nothing else is said.
+
+    So does that of a robot that somebody simulates by ``frictionloss`` alone, and of no machine.
+
+    :param values: of the model that leaves something, (p,)
+    :param named: indices of its effects that were not known
+    """
+    simulation, model = problem.simulation, problem.simulation.model.__copy__()
+    there = [e for i, e in enumerate(simulation.effects) if i in named or e.known]
+    joints = [e for e in there if e.kind in DRY]
+    free = np.concatenate(
+        [np.arange(s.start, s.stop) for e, s in zip(simulation.effects, simulation.slices) if e in there]
+    )
+    dofs = [d for d in (model.jnt_dofadr[e.index] for e in joints) if model.dof_frictionloss[d] == 0]
+    if not dofs:
+        return []
+    model.dof_frictionloss[dofs] = LITTLE  # a joint that has some keeps its own constraint, see World.rough
+    soft = Simulation(model, [copy(e) for e in simulation.effects], simulation.nthread)
+    fit = Problem(soft, problem.windows, problem.scales).fit(values, free, iterations=SOFT_FIT)
+    share = float(np.median(fit.errors) / np.median(problem.score(values).errors))
+    if share > 1 - WORSE:
+        return []
+    message = (
+        f"dry friction that gives way over {1e3 * model.dof_solref[dofs[0], 0]:g} ms, as MuJoCo's does by default, "
+        f'leaves {share:.0%} of the error. Is this robot simulated? Set solreffriction="0.001 1" solimpfriction="0.99 0.99" '
+        "there, as friction of machines holds; or give the model such a frictionloss and declare it"
+    )
+    return [Finding("soft friction", ", ".join(e.label for e in joints), message)]
 
 
 def own_steps(

@@ -14,6 +14,7 @@ from sb3_rpto.effects import LIBRARY, Declared, Effect, Scales, Simulation
 from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.library import given
 from sb3_rpto.effects.model import load_model
+from sb3_rpto.effects.names import near
 from sb3_rpto.effects.trial import try_out
 from sb3_rpto.envs.steps import odd_step
 from sb3_rpto.tracing.checks import Finding
@@ -210,7 +211,7 @@ def _candidates(model: mujoco.MjModel, there: Sequence[Effect], kinds: Sequence[
     if kinds is not None:
         unknown = [k for k in kinds if k not in LIBRARY]
         if unknown:
-            raise ValueError(f"candidates: no effect {unknown[0]!r} is registered; known: {', '.join(sorted(LIBRARY))}")
+            raise ValueError(f"candidates: no effect {unknown[0]!r} is registered; {near(unknown[0], sorted(LIBRARY))}")
     labels = {effect.label for effect in there}
     found = all_candidates(model, [effect.label for effect in there if isinstance(effect, Declared)])
     return [e for e in found if e.label not in labels and (kinds is None or e.kind in kinds)]

@@ -20,6 +20,7 @@ from sb3_rpto.tracing.cautions import (
     missed,
     no_nearer,
     own_steps,
+    soft_instead,
     strays,
     undetermined,
 )
@@ -152,6 +153,7 @@ def trace(
     else:
         findings += doubts(set_up.nominal, fitted) + early_response(found, fitted)
         findings += no_nearer(errors_before, errors_after) if selection.model.effects else []
+        findings += soft_instead(problem, final, selection.model.effects) if not fitted.simulated else []
     findings += undetermined(problem, final, intervals) + at_bounds(problem, final)
     findings += strays(selector, final, set_up, seed)
     kept = _kept(selection, simulation, final, intervals, selector.limit(selection.model), seed)

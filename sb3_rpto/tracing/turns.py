@@ -37,6 +37,8 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
             joint = joints.index(name)
             where, limited = f"{episode.name}, qpos.{name}", bool(model.jnt_limited[joint])
             low, high = model.jnt_range[joint] if limited else (-np.inf, np.inf)
+            if limited and model.jnt_type[joint] == _HINGE:
+                _check_radians(qpos[:, column], low, high, where)
             middle = float(np.median(qpos[:, column]))
             if model.jnt_type[joint] == _HINGE and ((not low <= middle <= high) or where in wrapped):
                 centre = (low + high) / 2 if limited else float(model.qpos_spring[model.jnt_qposadr[joint]])
@@ -47,7 +49,22 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
                     found.append(Finding("whole turns", where, f"{turns:+d} turn(s) from the joint's {why}; taken off"))
             over = float(np.maximum(low - qpos[:, column], qpos[:, column] - high).max())
             if over > BEYOND and not (data.exact or data.simulated):
-                message = f"up to {over:.3g} beyond the joint's limits in the model: another zero, or other units"
+                message = (
+                    f"up to {over:.3g} beyond the joint's limits in the model (rad or m): another zero, or other units"
+                )
                 found.append(Finding("outside limits", where, message))
         episodes.append(replace(episode, qpos=qpos))
     return replace(data, episodes=episodes), found
+
+
+def _check_radians(angles: np.ndarray, low: float, high: float, where: str) -> None:
+    """Refuse angles that move further than a joint's limits let it, and are within them if they are in degrees.
+
+    :raises ValueError: such angles
+    """
+    inside = np.all((np.deg2rad(angles) > low - BEYOND) & (np.deg2rad(angles) < high + BEYOND))
+    if inside and np.ptp(angles) > high - low + np.pi:
+        raise ValueError(
+            f"{where} spans {np.ptp(angles):.3g} where the model's limits are {low:.3g} and {high:.3g} rad; give rad, "
+            'not degrees (also where the MJCF has angle="degree")'
+        )

@@ -406,7 +406,7 @@ def test_a_source_of_branches_has_no_episode_to_restore(tmp_path):
         small(RPTO, source, learning_starts=0).learn(30, source_timesteps=0).save(tmp_path / "model.zip")
         resumed = RPTO.load(tmp_path / "model.zip", env=source, target_env=pendulum(12.0))
         with warnings.catch_warnings():
-            warnings.filterwarnings("error", message=".*cannot restore its state")
+            warnings.filterwarnings("error", message=".*cannot be restored")
             resumed.learn(10, reset_num_timesteps=False)
     finally:
         source.close()

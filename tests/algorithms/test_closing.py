@@ -1058,7 +1058,7 @@ def test_a_checkpoint_of_a_log_goes_on_in_a_target_without_a_word_of_its_state(s
     model([], target_data=measured).learn(40, source_timesteps=0).save(tmp_path / "model")
     made = RPTO.load(tmp_path / "model", env=gym.make(TASK), target_env=target([]), device="cpu")
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", message=".*cannot restore its state")
+        warnings.filterwarnings("error", message=".*cannot be restored")
         made.learn(45, reset_num_timesteps=False)
     assert made.target_spent == {"learning": 45}
 

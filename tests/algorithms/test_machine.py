@@ -3,6 +3,7 @@
 import warnings
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 import torch as th
@@ -13,6 +14,7 @@ from sb3_rpto import RPTO
 from sb3_rpto.algorithms.machine import LARGE, check_machine, doubt_rules
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.effects import declare
+from sb3_rpto.effects.model import sites_act
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.envs.rules import task_rules
 
@@ -164,3 +166,12 @@ def test_another_cart_pole_as_source_is_told(tmp_path):
     rpto.save(tmp_path / "m.zip")
     with pytest.warns(UserWarning, match=r"\(gravity differ"):
         RPTO.load(tmp_path / "m.zip", cartpole(gravity=20.0))
+
+
+@pytest.mark.parametrize("held", [False, True], ids=["a mark", "a motor's place"])
+def test_a_mark_that_a_task_moves_is_no_other_simulator(held: bool) -> None:
+    pushed = '<actuator><general site="goal" gear="1 0 0 0 0 0"/></actuator>' if held else ""
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody><body><joint name='hinge'/><geom size='.1'/><site name='goal'/></body></worldbody>{pushed}</mujoco>"
+    )
+    assert sites_act(model) == held

@@ -8,6 +8,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 import sb3_rpto  # noqa: F401  (registers the environments)
 from sb3_rpto.envs import observations as module
+from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.envs.observations import States, register_state_map, single_env, state_map
 
 NOT_SHOWN = {"Ant": 2, "HalfCheetah": 1, "Hopper": 1, "Humanoid": 2, "HumanoidStandup": 2, "Swimmer": 2, "Walker2d": 1}
@@ -198,3 +199,27 @@ def test_subprocesses_are_refused():
 
     with pytest.raises(ValueError, match="give one environment"):
         single_env(Elsewhere())
+
+
+def test_a_map_that_gives_another_state_than_the_simulations_is_refused_before_anything_is_learned(monkeypatch):
+    monkeypatch.setattr(module, "_registered", {})
+    env = gym.make("InvertedPendulum-v5")
+
+    def made(sign, first, then):
+        def recover(obs):
+            qpos, qvel = sign * obs[:, first], obs[:, then]
+            return States(qpos, qvel, np.isfinite(qpos), np.isfinite(qvel))
+
+        return lambda env: recover
+
+    begin, end = slice(0, 2), slice(2, 4)
+    for sign, first, then in ((1, end, begin), (-1, begin, end), (57.3, begin, end)):
+        register_state_map("InvertedPendulum-v5", made(sign, first, then))
+        with pytest.raises(ValueError, match=r"InvertedPendulum-v5: qpos\[0\] is .* is read as .*register_state_map"):
+            physical_config(env)
+    register_state_map("InvertedPendulum-v5", made(1, begin, end))
+    physical_config(env)
+    noise = np.random.default_rng(0)
+    seen = gym.wrappers.TransformObservation(env, lambda o: o + noise.normal(0, 1e-3, 4), env.observation_space)
+    with pytest.warns(UserWarning, match="registered state map"):
+        physical_config(seen)

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import wrappers
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecCheckNan, VecMonitor, VecNormalize
@@ -310,3 +311,36 @@ def test_whether_reset_takes_a_seed():
     assert not accepts_seed(OldReset())
     assert not accepts_seed(Monitor(Keywords(OldReset())))
     assert not accepts_seed(wrappers.TimeLimit(OldReset(), 5))
+
+
+class Moved(InvertedPendulumEnv):
+    """Its own state beside the simulation's; its class's ``set_state`` takes positions and velocities."""
+
+    goal = 0.0
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        self.goal += 1.0
+        return observation, self.goal, *rest
+
+    def save_state(self):
+        return self.goal, self.data.qpos.copy(), self.data.qvel.copy(), self.np_random.bit_generator.state
+
+    def restore_state(self, state):
+        self.goal = state[0]
+        self.set_state(state[1], state[2])
+        self.np_random.bit_generator.state = state[3]
+
+
+def test_a_mujoco_environment_of_ones_own_saves_its_state_by_names_that_mujocoenv_has_not():
+    def make():
+        env = make_vec_env(lambda: wrappers.TimeLimit(Moved(), 30), 1, seed=3)
+        env.reset()
+        return env
+
+    one, other, actions = make(), make(), np.full((40, 1, 1), 0.1, dtype=np.float32)
+    run(one, actions[:10])
+    state = pickle.loads(pickle.dumps(save_state(one)))
+    expected = run(one, actions)
+    restore_state(other, state)
+    assert_same(run(other, actions), expected)

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from sb3_rpto.effects import Simulation
+from sb3_rpto.effects import LIBRARY, Simulation
 from sb3_rpto.effects.forces import Spring, TorqueOffset
-from sb3_rpto.tracing import Measurements
+from sb3_rpto.tracing import Measurements, trace
 from sb3_rpto.tracing.cautions import above_noise, encoder_zeros, no_nearer, own_steps
 from sb3_rpto.tracing.evaluate import HorizonError
 from sb3_rpto.tracing.windows import discretised
@@ -75,3 +75,30 @@ def test_a_constant_torque_where_a_servo_holds_may_be_a_zero_of_the_recordings_o
     assert "two zeros that differ by -0.5 rad" in geared
     for other in ('<motor joint="elbow"/>', '<velocity joint="elbow" kv="3"/>'):
         assert named(other) == []
+
+
+HINGED = """<mujoco><option timestep="0.001" integrator="RK4"/><worldbody><body>
+<joint name="hinge" axis="0 1 0" damping="0.05" {}/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="1"/>
+</body></worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+HOLDS = 'solreffriction="0.002 1" solimpfriction="0.99 0.99"'
+
+
+@pytest.mark.parametrize("constraint", ["", HOLDS], ids=["creeps", "holds"])
+def test_friction_that_creeps_as_mujocos_does_by_default_is_told(constraint: str) -> None:
+    model = mujoco.MjModel.from_xml_string(HINGED.format(f'frictionloss="0.3" {constraint}'))
+    rng, tables = np.random.default_rng(0), {}
+    for run in range(4):
+        data, rows = mujoco.MjData(model), []
+        data.qpos[0], phase = rng.uniform(-1, 1), rng.uniform(0, 6)
+        for k in range(250):
+            data.ctrl[0] = 0.9 * np.sin(phase + 2.0 * data.time)
+            rows.append((data.time, data.qpos[0] + rng.normal(0, 5e-4), data.ctrl[0]))
+            mujoco.mj_step(model, data, 10)
+        tables[f"run{run}"] = dict(zip(("time", "qpos.hinge", "ctrl.motor"), np.array(rows).T))
+    known = [LIBRARY["coulomb_friction"]("hinge", level=0.3)]
+    report = trace(
+        HINGED.format(""), Measurements.from_tables(tables), ["hinge.damping"], known=known, candidates=[], threads=1
+    )
+    assert (report.verdict == "complete") == bool(constraint)
+    told = [f.where for f in report.findings if f.kind == "soft friction"]
+    assert told == ([] if constraint else ["coulomb_friction(hinge)"])

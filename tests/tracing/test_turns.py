@@ -46,9 +46,16 @@ def test_turns_that_may_be_meant_stay(joint: str) -> None:
 
 
 def test_what_no_turn_accounts_for_is_said_and_kept() -> None:
-    degrees = np.degrees(ANGLE[:100])
-    _, found = settle_turns(arm('range="-1.5 1.5"'), recorded(degrees))
+    _, found = settle_turns(arm('range="-1.5 1.5"'), recorded(ANGLE + 1.4))
     assert "outside limits" in [f.kind for f in found]
+
+
+def test_degrees_are_refused_where_the_joints_limits_tell_them() -> None:
+    with pytest.raises(
+        ValueError, match=r"run, qpos.hinge spans \d+.* limits are -1.5 and 1.5 rad; give rad, not degrees"
+    ):
+        settle_turns(arm('range="-1.5 1.5"'), recorded(np.degrees(ANGLE)))
+    settle_turns(arm(""), recorded(np.degrees(ANGLE)))  # a wheel may well turn so far
 
 
 def test_a_joint_without_a_name_has_whole_turns_too() -> None:
