@@ -176,12 +176,11 @@ def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> 
     simulation, model = problem.simulation, problem.simulation.model.__copy__()
     there = [e for i, e in enumerate(simulation.effects) if i in named or e.known]
     joints = [e for e in there if e.kind in DRY]
-    free = np.concatenate(
-        [np.arange(s.start, s.stop) for e, s in zip(simulation.effects, simulation.slices) if e in there]
-    )
     dofs = [d for d in (model.jnt_dofadr[e.index] for e in joints) if model.dof_frictionloss[d] == 0]
     if not dofs:
         return []
+    places = [s for e, s in zip(simulation.effects, simulation.slices) if e in there]
+    free = np.concatenate([np.arange(s.start, s.stop) for s in places])
     model.dof_frictionloss[dofs] = LITTLE  # a joint that has some keeps its own constraint, see World.rough
     soft = Simulation(model, [copy(e) for e in simulation.effects], simulation.nthread)
     fit = Problem(soft, problem.windows, problem.scales).fit(values, free, iterations=SOFT_FIT)
@@ -190,8 +189,8 @@ def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> 
         return []
     message = (
         f"dry friction that gives way over {1e3 * model.dof_solref[dofs[0], 0]:g} ms, as MuJoCo's does by default, "
-        f'leaves {share:.0%} of the error. Is this robot simulated? Set solreffriction="0.001 1" solimpfriction="0.99 0.99" '
-        "there, as friction of machines holds; or give the model such a frictionloss and declare it"
+        f'leaves {share:.0%} of the error. Is this robot simulated? Set solreffriction="0.001 1" '
+        'solimpfriction="0.99 0.99" there, as friction of machines holds; or give the model such a frictionloss and declare it'
     )
     return [Finding("soft friction", ", ".join(e.label for e in joints), message)]
 

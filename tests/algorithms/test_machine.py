@@ -172,6 +172,7 @@ def test_another_cart_pole_as_source_is_told(tmp_path):
 def test_a_mark_that_a_task_moves_is_no_other_simulator(held: bool) -> None:
     pushed = '<actuator><general site="goal" gear="1 0 0 0 0 0"/></actuator>' if held else ""
     model = mujoco.MjModel.from_xml_string(
-        f"<mujoco><worldbody><body><joint name='hinge'/><geom size='.1'/><site name='goal'/></body></worldbody>{pushed}</mujoco>"
+        "<mujoco><worldbody><body><joint name='hinge'/><geom size='.1'/><site name='goal'/></body></worldbody>"
+        f"{pushed}</mujoco>"
     )
     assert sites_act(model) == held

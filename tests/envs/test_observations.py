@@ -7,8 +7,8 @@ from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 import sb3_rpto  # noqa: F401  (registers the environments)
-from sb3_rpto.envs import observations as module
 from sb3_rpto.dynamics.simulator import physical_config
+from sb3_rpto.envs import observations as module
 from sb3_rpto.envs.observations import States, register_state_map, single_env, state_map
 
 NOT_SHOWN = {"Ant": 2, "HalfCheetah": 1, "Hopper": 1, "Humanoid": 2, "HumanoidStandup": 2, "Swimmer": 2, "Walker2d": 1}

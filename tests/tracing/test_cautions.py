@@ -90,7 +90,7 @@ def test_friction_that_creeps_as_mujocos_does_by_default_is_told(constraint: str
     for run in range(4):
         data, rows = mujoco.MjData(model), []
         data.qpos[0], phase = rng.uniform(-1, 1), rng.uniform(0, 6)
-        for k in range(250):
+        for _ in range(250):
             data.ctrl[0] = 0.9 * np.sin(phase + 2.0 * data.time)
             rows.append((data.time, data.qpos[0] + rng.normal(0, 5e-4), data.ctrl[0]))
             mujoco.mj_step(model, data, 10)
