@@ -189,8 +189,8 @@ def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> 
         return []
     message = (
         f"dry friction that gives way over {1e3 * model.dof_solref[dofs[0], 0]:g} ms, as MuJoCo's does by default, "
-        f'leaves {share:.0%} of the error. Is this robot simulated? Set solreffriction="0.001 1" '
-        'solimpfriction="0.99 0.99" there, as friction of machines holds; or give the model such a frictionloss and declare it'
+        f'leaves {share:.0%} of the error. Is this robot simulated? Set solreffriction="0.001 1" there, and '
+        'solimpfriction="0.99 0.99", as friction of machines holds; or give the model such a frictionloss and declare it'
     )
     return [Finding("soft friction", ", ".join(e.label for e in joints), message)]
 
