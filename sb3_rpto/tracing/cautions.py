@@ -190,7 +190,7 @@ def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> 
     message = (
         f"dry friction that gives way over {1e3 * model.dof_solref[dofs[0], 0]:g} ms, as MuJoCo's does by default, "
         f'leaves {share:.0%} of the error. Is this robot simulated? Set solreffriction="0.001 1" there, and '
-        'solimpfriction="0.99 0.99", as friction of machines holds; or give the model such a frictionloss and declare it'
+        'solimpfriction="0.99 0.99", as that of machines holds; or give the model such friction and declare it'
     )
     return [Finding("soft friction", ", ".join(e.label for e in joints), message)]
 
