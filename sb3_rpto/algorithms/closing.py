@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.rehearsals import Rehearsals
+from sb3_rpto.algorithms.relabel import relabelled
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.onestep import remembered
@@ -76,6 +77,8 @@ class LoopCloser:
         self._error = math.inf
         #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
         self.stale = False
+        #: how many transitions at the beginning of D_source are of no episode
+        self.relabelled = 0
         #: whether phi is what a trace of noisy transitions made it
         self.keeps_phi = False
         #: whether the simulator accounts for the target by the last trace, so that it may judge policies
@@ -142,7 +145,7 @@ class LoopCloser:
         added = self._take(model, dynamics, report, data, before if noise is None else math.inf)
         self._error = dynamics.error(data)
         _say(model, report, added, f"{len(data)} target transitions", before, self._error)
-        self.stale = bool(added) or outdated(model, dynamics)
+        self.stale = bool(added) or outdated(model, dynamics, self.relabelled)
         self.renew(model)
 
     def close_on_log(self, model: Looping, dynamics: PhysicalDynamics, measured: Measurements) -> None:
@@ -181,7 +184,8 @@ class LoopCloser:
         """
         if self.stale:
             model.snapshots.pop("learner", None)  # of the simulator that is dropped
-            renew_source(model)
+            assert isinstance(model.dynamics, PhysicalDynamics)  # what was traced
+            self.relabelled = renew_source(model, model.dynamics)
             if model.updates_policy and not model._offline and model.updates_per_step:
                 learn_in_source(model, lambda: self.rehearse(model))
                 if self.may_judge(model):
@@ -393,26 +397,35 @@ def _from_resets(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
     return observations, np.array(actions)
 
 
-def outdated(model: Looping, dynamics: PhysicalDynamics) -> bool:
+def outdated(model: Looping, dynamics: PhysicalDynamics, lead: int = 0) -> bool:
     """Whether D_source holds what another simulator than the present one produced.
 
     Where the oldest transitions were overwritten, the next ones have lost the commands that late motors still act on.
+
+    :param lead: so many at its beginning are of no episode: the commands before them are not known
     """
-    side, lead = model.replay_buffer.source, 0
+    side = model.replay_buffer.source
     if side.full:
         lead = min(remembered(dynamics.model, dynamics.frame_skip) * int(model.source_steps), side.size() // 2)
     return dynamics.error(model.transitions("source").take(slice(lead + OLDEST)), lead=lead) > OTHER
 
 
-def renew_source(model: Looping) -> None:
-    """Drop what another simulator produced, and take the first :data:`FILL` steps in the present one.
+def renew_source(model: Looping, dynamics: PhysicalDynamics) -> int:
+    """Simulate again what another simulator produced, and take the first :data:`FILL` steps in the present one.
 
     They begin with episodes: of one under way the commands before it are dropped too, which late motors still act on.
+
+    :return: how many transitions D_source begins with that are of no episode
     """
     assert model._source_world is not None
+    again = relabelled(model, dynamics)
+    count = len(again["actions"])
     model.replay_buffer.source.reset()
+    if count:
+        model.replay_buffer.append("source", dones=again.pop("terminations"), **again)
     model._source_world.begin_anew()
-    model.source_timesteps += model._source_world.interact(model, FILL)
+    model.source_timesteps += count + model._source_world.interact(model, FILL)
+    return count
 
 
 def learn_for_a_step(model: Looping) -> int:

@@ -94,7 +94,7 @@ def transitions(
         qpos, qvel, commands, whole = log.steps(episode)
         if simulation is not None and len(qpos):
             simulation.undo_sensors(np.tile(simulation.values(), (len(qpos), 1)), qpos, qvel)
-        seen = np.array([_observe(twin, *state) for state in zip(qpos, qvel, commands)])
+        seen = np.array([observe(twin, *state) for state in zip(qpos, qvel, commands)])
         if whole.any():
             found["observations"].append(seen[:-1][whole])
             found["next_observations"].append(seen[1:][whole])
@@ -177,7 +177,7 @@ class _Log:
         return qpos, qvel
 
 
-def _observe(env: gym.Env, qpos: np.ndarray, qvel: np.ndarray, command: np.ndarray) -> np.ndarray:
+def observe(env: gym.Env, qpos: np.ndarray, qvel: np.ndarray, command: np.ndarray) -> np.ndarray:
     """What the agent would see in a state, (observation_dim,)."""
     base: Any = env.unwrapped
     base.data.ctrl[:] = command  # some tasks observe forces

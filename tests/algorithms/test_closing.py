@@ -346,8 +346,8 @@ def test_renewed_data_are_the_simulators_own_where_commands_are_late() -> None:
     late = LIBRARY["command_delay"]("slide", delay=0.05).to_json()
     made = model([], dynamics_kwargs={"effects": [late]})
     made.learn(1, source_timesteps=63)
-    renew_source(made)
-    assert not outdated(made, dynamics(made))
+    count = renew_source(made, dynamics(made))
+    assert not outdated(made, dynamics(made), count)
 
 
 def test_data_that_have_lost_their_past_are_not_another_simulators() -> None:
@@ -528,7 +528,7 @@ def test_a_policy_that_knows_the_source_begins_in_the_corrected_one(monkeypatch:
     monkeypatch.setattr(
         made.loop, "_trace", lambda *_: made.loop.found.append({"verdict": "explained"}) or explanation(friction())
     )  # type: ignore[union-attr,func-returns-value]
-    monkeypatch.setattr(closing, "renew_source", lambda _: pytest.fail("drops what the corrected simulator produced"))
+    monkeypatch.setattr(closing, "renew_source", lambda *_: pytest.fail("drops what the corrected simulator produced"))
     made.learn(8)
     seen = made.replay_buffer.target.size()
     made.replay_buffer.target.reset()  # as of a model that is loaded without its buffers

@@ -1,0 +1,89 @@
+"""D_source when the simulator was corrected: the same states and actions, with what follows there now."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_rpto.algorithms.looping import Looping
+from sb3_rpto.algorithms.recorded import observe
+from sb3_rpto.algorithms.source import copied
+from sb3_rpto.buffers import chronological
+from sb3_rpto.dynamics.physical import PhysicalDynamics
+from sb3_rpto.effects.stance import StandingEnv
+
+#: Most transitions that are simulated again, the newest.
+MOST = 50_000
+#: How well the state must account for the observation, as a share of the latter and at least.
+SHOWN = 1e-3
+#: A longer leg may not stand in the floor: by how much deeper than before, as a share of the model's extent.
+DEEPER = 0.01
+
+
+def relabelled(model: Looping, dynamics: PhysicalDynamics) -> dict[str, np.ndarray]:
+    """Transitions from the states of D_source under its actions, as the fitted simulator has them.
+
+    What the policy learned from in another simulator has visited more than a policy that begins to learn in this one,
+    whose critic would be lost with nothing else to learn from. Before a step the policy's own action was given, which
+    late motors still act on. Left out are states that an observation does not tell, and those in which the corrected
+    body would stand in the floor.
+
+    :param model: with D_source
+    :param dynamics: the simulator, its effects with their values
+    :return: as :func:`sb3_rpto.buffers.chronological`, oldest first; empty where observations are not of the state
+    """
+    assert model.env is not None
+    arrays = {name: values[-MOST:] for name, values in chronological(model.replay_buffer.source).items()}
+    before, after = copied(model.env), StandingEnv(copied(model.env), dynamics.effects())
+    found: dict[str, list[Any]] = {name: [] for name in arrays}
+    rows = [] if after.alters_observations else _recovered(dynamics, arrays["observations"])
+    for env in (before, after):
+        env.reset(seed=0)
+    base: Any = after.unwrapped
+    actions = model.policy.unscale_action(arrays["actions"])
+    normaliser, seen = model.get_vec_normalize_env(), arrays["observations"]
+    seen = seen if normaliser is None else normaliser.normalize_obs(seen)
+    earlier = model.predict(seen, deterministic=False)[0] if rows else actions
+    for i, qpos, qvel in rows:
+        observation, action = arrays["observations"][i], actions[i]
+        shown = observe(before, qpos, qvel, action)
+        if not np.allclose(shown, observation, SHOWN, SHOWN):
+            continue  # a goal, say, that is not of the state
+        after.reset()
+        after.step(earlier[i])
+        start = observe(after, qpos, qvel, action)
+        if _depth(after) > _depth(before) + DEEPER * base.model.stat.extent:
+            continue
+        then, reward, terminated, _, _ = after.step(action)
+        step = {"observations": start, "next_observations": then, "actions": arrays["actions"][i]}
+        step |= {"rewards": reward, "terminations": terminated}
+        if all(np.isfinite(np.asarray(value, dtype=float)).all() for value in step.values()):
+            for name, value in step.items():
+                found[name].append(value)
+    return {
+        name: np.array(found[name], dtype=arrays[name].dtype).reshape(-1, *arrays[name].shape[1:]) for name in found
+    }
+
+
+def _recovered(dynamics: PhysicalDynamics, observations: np.ndarray) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """Rows whose states are known but for coordinates that no observation holds, which are as in the model."""
+    if not len(observations):
+        return []
+    states = dynamics.recover(observations.astype(float))
+    parts, whole = [], np.ones(len(observations), dtype=bool)
+    for values, known, nominal in (
+        (states.qpos, states.known_qpos, dynamics.model.qpos0),
+        (states.qvel, states.known_qvel, np.zeros(dynamics.model.nv)),
+    ):
+        seen = known.any(axis=0)
+        whole &= known[:, seen].all(axis=1)
+        parts.append(np.where(seen, values, nominal))
+    return [(int(i), parts[0][i], parts[1][i]) for i in np.flatnonzero(whole)]
+
+
+def _depth(env: gym.Env) -> float:
+    """How deep the deepest contact is, m."""
+    base: Any = env.unwrapped
+    return float(max(0.0, -base.data.contact.dist.min(initial=0.0)))
