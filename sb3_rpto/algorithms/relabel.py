@@ -12,13 +12,13 @@ from sb3_rpto.algorithms.recorded import observe
 from sb3_rpto.algorithms.source import copied
 from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.physical import PhysicalDynamics
-from sb3_rpto.effects.stance import StandingEnv
+from sb3_rpto.effects.stance import StandingEnv, lifted
 
 #: Most transitions that are simulated again, the newest.
 MOST = 50_000
 #: How well the state must account for the observation, as a share of the latter and at least.
 SHOWN = 1e-3
-#: A longer leg may not stand in the floor: by how much deeper than before, as a share of the model's extent.
+#: A longer body may not be in something: by how much deeper than before, as a share of the model's extent.
 DEEPER = 0.01
 
 
@@ -27,8 +27,8 @@ def relabelled(model: Looping, dynamics: PhysicalDynamics) -> dict[str, np.ndarr
 
     What the policy learned from in another simulator has visited more than a policy that begins to learn in this one,
     whose critic would be lost with nothing else to learn from. Before a step the policy's own action was given, which
-    late motors still act on. Left out are states that an observation does not tell, and those in which the corrected
-    body would stand in the floor.
+    late motors still act on. A walker is as far from the floor as it was; left out are states that an observation does
+    not tell, and those in which the corrected body would be in something.
 
     :param model: with D_source
     :param dynamics: the simulator, its effects with their values
@@ -42,9 +42,11 @@ def relabelled(model: Looping, dynamics: PhysicalDynamics) -> dict[str, np.ndarr
     for env in (before, after):
         env.reset(seed=0)
     base: Any = after.unwrapped
+    nominal = before.unwrapped.model  # type: ignore[attr-defined]
     actions = model.policy.unscale_action(arrays["actions"])
     normaliser, seen = model.get_vec_normalize_env(), arrays["observations"]
-    seen = seen if normaliser is None else normaliser.normalize_obs(seen)
+    if normaliser is not None:
+        seen = np.asarray(normaliser.normalize_obs(seen))
     earlier = model.predict(seen, deterministic=False)[0] if rows else actions
     for i, qpos, qvel in rows:
         observation, action = arrays["observations"][i], actions[i]
@@ -53,7 +55,7 @@ def relabelled(model: Looping, dynamics: PhysicalDynamics) -> dict[str, np.ndarr
             continue  # a goal, say, that is not of the state
         after.reset()
         after.step(earlier[i])
-        start = observe(after, qpos, qvel, action)
+        start = observe(after, lifted(qpos, nominal, base.model), qvel, action)
         if _depth(after) > _depth(before) + DEEPER * base.model.stat.extent:
             continue
         then, reward, terminated, _, _ = after.step(action)

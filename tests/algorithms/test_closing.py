@@ -242,10 +242,13 @@ def test_no_target_step_is_spent_on_tracing() -> None:
     assert made.target_spent == {"learning": 100}
 
 
-def test_what_an_uncorrected_source_produced_is_dropped() -> None:
+def test_what_an_uncorrected_source_produced_is_simulated_again() -> None:
     made = learned()
+    assert made.loop is not None
+    assert made.loop.relabelled > 100
     # Since the trace at step 80 alone: the first and the fresh steps, then four for each target step.
-    assert made.replay_buffer.source.size() < 25 + 28 + 4 + 4 * 21
+    assert made.replay_buffer.source.size() - made.loop.relabelled < 25 + 28 + 4 + 4 * 21
+    assert dynamics(made).error(made.transitions("source").take(slice(made.loop.relabelled))) < closing.OTHER
 
 
 def test_source_episodes_have_the_effect() -> None:
@@ -860,7 +863,7 @@ def test_after_a_log_the_best_policy_is_left_and_the_last_one_goes_on_learning(m
     assert made.loop is not None
     scripted(made, monkeypatch, 99.0, 99.0)
     monkeypatch.setattr(made.loop.rehearsals, "due", lambda _: False)
-    made.loop.rehearsals.best = 100.0
+    made.loop.rehearsals.best, made.loop.rehearsals.last = 100.0, 99.0
     best = weights(made)
     made.take_snapshot("simulator")
     spoil(made)
