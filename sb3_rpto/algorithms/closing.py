@@ -17,7 +17,7 @@ from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.onestep import remembered
 from sb3_rpto.dynamics.physical import PhysicalDynamics
-from sb3_rpto.effects import Declared, from_json
+from sb3_rpto.effects import Declared, Effect, from_json
 from sb3_rpto.envs.observations import single_env
 from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Measurements, Report, trace
@@ -79,6 +79,8 @@ class LoopCloser:
         self.stale = False
         #: how many transitions at the beginning of D_source are of no episode
         self.relabelled = 0
+        #: effects of the simulator that made D_source, for :func:`sb3_rpto.effects.from_json`
+        self.made_by: list[dict[str, Any]] = []
         #: whether phi is what a trace of noisy transitions made it
         self.keeps_phi = False
         #: whether the simulator accounts for the target by the last trace, so that it may judge policies
@@ -185,7 +187,8 @@ class LoopCloser:
         if self.stale:
             model.snapshots.pop("learner", None)  # of the simulator that is dropped
             assert isinstance(model.dynamics, PhysicalDynamics)  # what was traced
-            self.relabelled = renew_source(model, model.dynamics)
+            self.relabelled = renew_source(model, model.dynamics, list(map(from_json, self.made_by)))
+            self.made_by = [effect.to_json() for effect in model.dynamics.effects()]
             if model.updates_policy and not model._offline and model.updates_per_step:
                 learn_in_source(model, lambda: self.rehearse(model))
                 if self.may_judge(model):
@@ -410,15 +413,16 @@ def outdated(model: Looping, dynamics: PhysicalDynamics, lead: int = 0) -> bool:
     return dynamics.error(model.transitions("source").take(slice(lead + OLDEST)), lead=lead) > OTHER
 
 
-def renew_source(model: Looping, dynamics: PhysicalDynamics) -> int:
+def renew_source(model: Looping, dynamics: PhysicalDynamics, made_by: Sequence[Effect] = ()) -> int:
     """Simulate again what another simulator produced, and take the first :data:`FILL` steps in the present one.
 
     They begin with episodes: of one under way the commands before it are dropped too, which late motors still act on.
 
+    :param made_by: effects of the simulator that made D_source so far
     :return: how many transitions D_source begins with that are of no episode
     """
     assert model._source_world is not None
-    again = relabelled(model, dynamics)
+    again = relabelled(model, dynamics, made_by)
     count = len(again["actions"])
     model.replay_buffer.source.reset()
     if count:

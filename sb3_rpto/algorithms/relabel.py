@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +13,7 @@ from sb3_rpto.algorithms.recorded import observe
 from sb3_rpto.algorithms.source import copied
 from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.physical import PhysicalDynamics
+from sb3_rpto.effects import Effect
 from sb3_rpto.effects.stance import StandingEnv, lifted
 
 #: Most transitions that are simulated again, the newest.
@@ -22,7 +24,7 @@ SHOWN = 1e-3
 DEEPER = 0.01
 
 
-def relabelled(model: Looping, dynamics: PhysicalDynamics) -> dict[str, np.ndarray]:
+def relabelled(model: Looping, dynamics: PhysicalDynamics, made_by: Sequence[Effect] = ()) -> dict[str, np.ndarray]:
     """Transitions from the states of D_source under its actions, as the fitted simulator has them.
 
     What the policy learned from in another simulator has visited more than a policy that begins to learn in this one,
@@ -32,17 +34,18 @@ def relabelled(model: Looping, dynamics: PhysicalDynamics) -> dict[str, np.ndarr
 
     :param model: with D_source
     :param dynamics: the simulator, its effects with their values
+    :param made_by: effects of the simulator that made D_source, beside the source itself
     :return: as :func:`sb3_rpto.buffers.chronological`, oldest first; empty where observations are not of the state
     """
     assert model.env is not None
     arrays = {name: values[-MOST:] for name, values in chronological(model.replay_buffer.source).items()}
-    before, after = copied(model.env), StandingEnv(copied(model.env), dynamics.effects())
+    before, after = (StandingEnv(copied(model.env), effects) for effects in (made_by, dynamics.effects()))
     found: dict[str, list[Any]] = {name: [] for name in arrays}
     rows = [] if after.alters_observations else _recovered(dynamics, arrays["observations"])
     for env in (before, after):
         env.reset(seed=0)
     base: Any = after.unwrapped
-    nominal = before.unwrapped.model  # type: ignore[attr-defined]
+    earlier_body: Any = before.unwrapped
     actions = model.policy.unscale_action(arrays["actions"])
     normaliser, seen = model.get_vec_normalize_env(), arrays["observations"]
     if normaliser is not None:
@@ -55,7 +58,7 @@ def relabelled(model: Looping, dynamics: PhysicalDynamics) -> dict[str, np.ndarr
             continue  # a goal, say, that is not of the state
         after.reset()
         after.step(earlier[i])
-        start = observe(after, lifted(qpos, nominal, base.model), qvel, action)
+        start = observe(after, lifted(qpos, earlier_body.model, base.model), qvel, action)
         if _depth(after) > _depth(before) + DEEPER * base.model.stat.extent:
             continue
         then, reward, terminated, _, _ = after.step(action)

@@ -107,3 +107,17 @@ def test_nothing_is_made_of_sensors_that_err() -> None:
     again = relabelled(model, dynamics)
     assert {name: len(values) for name, values in again.items()} == dict.fromkeys(again, 0)
     assert again["observations"].shape == (0, 11)
+
+
+def test_what_a_corrected_simulator_made_is_not_corrected_twice() -> None:
+    model, dynamics = made("Hopper-v5")
+    (leg,) = declare(dynamics.model, ["leg.length"])
+    dynamics.adopt([leg.with_values(1.2 * leg.values)])
+    once = relabelled(model, dynamics)
+    model.replay_buffer.source.reset()
+    model.replay_buffer.append(
+        "source", dones=once["terminations"], **{n: v for n, v in once.items() if n != "terminations"}
+    )
+    twice = relabelled(model, dynamics, dynamics.effects())
+    for name, values in twice.items():
+        np.testing.assert_allclose(values, once[name], atol=2e-4, err_msg=name)
