@@ -79,8 +79,8 @@ class LoopCloser:
         self.stale = False
         #: how many transitions at the beginning of D_source are of no episode
         self.relabelled = 0
-        #: effects of the simulator that made D_source, for :func:`sb3_rpto.effects.from_json`
-        self.made_by: list[dict[str, Any]] = []
+        #: effects of the simulator that made D_source
+        self.made_by: list[Effect] = []
         #: whether phi is what a trace of noisy transitions made it
         self.keeps_phi = False
         #: whether the simulator accounts for the target by the last trace, so that it may judge policies
@@ -187,8 +187,8 @@ class LoopCloser:
         if self.stale:
             model.snapshots.pop("learner", None)  # of the simulator that is dropped
             assert isinstance(model.dynamics, PhysicalDynamics)  # what was traced
-            self.relabelled = renew_source(model, model.dynamics, list(map(from_json, self.made_by)))
-            self.made_by = [effect.to_json() for effect in model.dynamics.effects()]
+            self.relabelled = renew_source(model, model.dynamics, self.made_by)
+            self.made_by = model.dynamics.effects()
             if model.updates_policy and not model._offline and model.updates_per_step:
                 learn_in_source(model, lambda: self.rehearse(model))
                 if self.may_judge(model):
