@@ -1,4 +1,4 @@
-"""What closing the loop is worth, on three simulated robots with shifted targets.
+"""What closing the loop is worth, on four simulated robots with shifted targets.
 
     python examples/closed_loop_study.py --quick      # one task, one seed, 260 target steps: shows that it works
     python examples/closed_loop_study.py              # five seeds, resumable; days on two cores, so see --help

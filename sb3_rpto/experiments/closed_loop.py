@@ -67,9 +67,19 @@ TASKS = {
         ("coulomb_friction", 0.12, ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")),
         300_000,
     ),
+    "walker": Task(
+        "Walker2d-v5",
+        ("torso.length", "thigh*.length", "leg*.length", "torso.mass", "foot*geom.friction"),
+        (
+            "coulomb_friction",
+            0.1,
+            ("thigh_joint", "leg_joint", "foot_joint", "thigh_left_joint", "leg_left_joint", "foot_left_joint"),
+        ),
+        300_000,
+    ),
 }
 #: Which observations are speeds; what comes after them are forces of constraints, which are shown without noise.
-SPEEDS = {"double-pendulum": slice(5, 8), "hopper": slice(5, 11), "cheetah": slice(8, 17)}
+SPEEDS = {"double-pendulum": slice(5, 8), "hopper": slice(5, 11), "cheetah": slice(8, 17), "walker": slice(8, 17)}
 SHORT, LONG = (250, 500, 1_000, 2_000), (250, 500, 1_000, 2_000, 5_000, 10_000, 20_000)
 ORACLE_STEPS = 100_000
 PHYSICAL = {"dynamics": "physical"}
