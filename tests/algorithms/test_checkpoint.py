@@ -160,7 +160,7 @@ def test_a_world_that_is_built_otherwise_begins_a_new_episode(tmp_path):
     small(RPO).learn(30, source_timesteps=0).save(tmp_path / "model.zip")
     wrapped = gym.wrappers.RescaleAction(pendulum(12.0), -2.0, 2.0)
     model = RPO.load(tmp_path / "model.zip", env=pendulum(), target_env=wrapped)
-    with pytest.warns(UserWarning, match="target environment cannot restore"):
+    with pytest.warns(UserWarning, match="target environment cannot be restored"):
         model.learn(10, reset_num_timesteps=False)
     assert model.num_timesteps == 40
 
@@ -364,7 +364,7 @@ def test_a_step_is_kept_where_the_target_cannot_be_put_back(tmp_path):
     resumed = RPO.load(tmp_path / "model", env=pendulum(), target_env=Opaque(pendulum(12.0)), device="cpu")
     resumed.load_replay_buffer(tmp_path / "buffer")
     assert resumed.replay_buffer.target.size() == 19
-    with pytest.warns(UserWarning, match="target environment cannot restore"):
+    with pytest.warns(UserWarning, match="target environment cannot be restored"):
         resumed.learn(10, reset_num_timesteps=False)
     assert resumed.replay_buffer.target.size() == resumed.num_timesteps == resumed._n_updates == 30
     side = resumed.replay_buffer.target
@@ -393,7 +393,7 @@ def test_a_world_that_cannot_restore_its_state_says_so(tmp_path):
         model = small(RPO, target=target).learn(30, source_timesteps=0)
         model.save(tmp_path / "model.zip")
         resumed = RPO.load(tmp_path / "model.zip", env=pendulum(), target_env=target)
-        with pytest.warns(UserWarning, match="target environment cannot restore"):
+        with pytest.warns(UserWarning, match="target environment cannot be restored"):
             resumed.learn(10, reset_num_timesteps=False)
         assert resumed.num_timesteps == 40
     finally:
@@ -429,7 +429,7 @@ def test_another_number_of_episodes_side_by_side_begins_new_ones_and_loses_nothi
     )
     resumed = RPTO.load(tmp_path / "model", env=make(), target_env=target, source_steps=6, device="cpu")
     resumed.load_replay_buffer(tmp_path / "buffer")
-    with pytest.warns(UserWarning, match="the source environment cannot restore"):
+    with pytest.warns(UserWarning, match="the source environment cannot be restored"):
         resumed.learn(10, reset_num_timesteps=False)
     assert (resumed.num_timesteps, resumed.replay_buffer.target.size()) == (30, 30)
 
