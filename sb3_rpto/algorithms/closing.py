@@ -77,8 +77,6 @@ class LoopCloser:
         self._error = math.inf
         #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
         self.stale = False
-        #: how many transitions at the beginning of D_source are of no episode
-        self.relabelled = 0
         #: effects of the simulator that made D_source
         self.made_by: list[Effect] = []
         #: whether phi is what a trace of noisy transitions made it
@@ -147,7 +145,7 @@ class LoopCloser:
         added = self._take(model, dynamics, report, data, before if noise is None else math.inf)
         self._error = dynamics.error(data)
         _say(model, report, added, f"{len(data)} target transitions", before, self._error)
-        self.stale = bool(added) or outdated(model, dynamics, self.relabelled)
+        self.stale = bool(added) or outdated(model, dynamics)
         self.renew(model)
 
     def close_on_log(self, model: Looping, dynamics: PhysicalDynamics, measured: Measurements) -> None:
@@ -187,7 +185,7 @@ class LoopCloser:
         if self.stale:
             model.snapshots.pop("learner", None)  # of the simulator that is dropped
             assert isinstance(model.dynamics, PhysicalDynamics)  # what was traced
-            self.relabelled = renew_source(model, model.dynamics, self.made_by)
+            renew_source(model, model.dynamics, self.made_by)
             self.made_by = model.dynamics.effects()
             if model.updates_policy and not model._offline and model.updates_per_step:
                 learn_in_source(model, lambda: self.rehearse(model))
@@ -400,26 +398,23 @@ def _from_resets(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
     return observations, np.array(actions)
 
 
-def outdated(model: Looping, dynamics: PhysicalDynamics, lead: int = 0) -> bool:
+def outdated(model: Looping, dynamics: PhysicalDynamics) -> bool:
     """Whether D_source holds what another simulator than the present one produced.
 
     Where the oldest transitions were overwritten, the next ones have lost the commands that late motors still act on.
-
-    :param lead: so many at its beginning are of no episode: the commands before them are not known
     """
-    side = model.replay_buffer.source
+    side, lead = model.replay_buffer.source, 0
     if side.full:
         lead = min(remembered(dynamics.model, dynamics.frame_skip) * int(model.source_steps), side.size() // 2)
     return dynamics.error(model.transitions("source").take(slice(lead + OLDEST)), lead=lead) > OTHER
 
 
-def renew_source(model: Looping, dynamics: PhysicalDynamics, made_by: Sequence[Effect] = ()) -> int:
+def renew_source(model: Looping, dynamics: PhysicalDynamics, made_by: Sequence[Effect] = ()) -> None:
     """Simulate again what another simulator produced, and take the first :data:`FILL` steps in the present one.
 
     They begin with episodes: of one under way the commands before it are dropped too, which late motors still act on.
 
     :param made_by: effects of the simulator that made D_source so far
-    :return: how many transitions D_source begins with that are of no episode
     """
     assert model._source_world is not None
     again = relabelled(model, dynamics, made_by)
@@ -429,7 +424,6 @@ def renew_source(model: Looping, dynamics: PhysicalDynamics, made_by: Sequence[E
         model.replay_buffer.append("source", dones=again.pop("terminations"), **again)
     model._source_world.begin_anew()
     model.source_timesteps += count + model._source_world.interact(model, FILL)
-    return count
 
 
 def learn_for_a_step(model: Looping) -> int:

@@ -28,37 +28,31 @@ def relabelled(model: Looping, dynamics: PhysicalDynamics, made_by: Sequence[Eff
     """Transitions from the states of D_source under its actions, as the fitted simulator has them.
 
     What the policy learned from in another simulator has visited more than a policy that begins to learn in this one,
-    whose critic would be lost with nothing else to learn from. Before a step the policy's own action was given, which
-    late motors still act on. A walker is as far from the floor as it was; left out are states that an observation does
-    not tell, and those in which the corrected body would be in something.
+    whose critic would be lost with nothing else to learn from. A walker is as far from the floor as it was. Left
+    out are states that an observation does not tell, and those in which the corrected body would be in something.
 
     :param model: with D_source
     :param dynamics: the simulator, its effects with their values
     :param made_by: effects of the simulator that made D_source, beside the source itself
-    :return: as :func:`sb3_rpto.buffers.chronological`, oldest first; empty where observations are not of the state
+    :return: as :func:`sb3_rpto.buffers.chronological`, oldest first; empty where a step depends on more than the state,
+        as with late motors, or an observation shows something else
     """
     assert model.env is not None
     arrays = {name: values[-MOST:] for name, values in chronological(model.replay_buffer.source).items()}
     before, after = (StandingEnv(copied(model.env), effects) for effects in (made_by, dynamics.effects()))
-    found: dict[str, list[Any]] = {name: [] for name in arrays}
-    rows = [] if after.alters_observations else _recovered(dynamics, arrays["observations"])
-    for env in (before, after):
-        env.reset(seed=0)
-    base: Any = after.unwrapped
-    earlier_body: Any = before.unwrapped
     actions = model.policy.unscale_action(arrays["actions"])
-    normaliser, seen = model.get_vec_normalize_env(), arrays["observations"]
-    if normaliser is not None:
-        seen = np.asarray(normaliser.normalize_obs(seen))
-    earlier = model.predict(seen, deterministic=False)[0] if rows else actions
+    rows = [] if _more_than_state(after) else _recovered(dynamics, arrays["observations"])
+    before.reset(seed=0)
+    earlier: Any = before.unwrapped
+    base: Any = after.unwrapped
+    found: dict[str, list[Any]] = {name: [] for name in arrays}
     for i, qpos, qvel in rows:
         observation, action = arrays["observations"][i], actions[i]
         shown = observe(before, qpos, qvel, action)
         if not np.allclose(shown, observation, SHOWN, SHOWN):
             continue  # a goal, say, that is not of the state
         after.reset()
-        after.step(earlier[i])
-        start = observe(after, lifted(qpos, earlier_body.model, base.model), qvel, action)
+        start = observe(after, lifted(qpos, earlier.model, base.model), qvel, action)
         if _depth(after) > _depth(before) + DEEPER * base.model.stat.extent:
             continue
         then, reward, terminated, _, _ = after.step(action)
@@ -70,6 +64,13 @@ def relabelled(model: Looping, dynamics: PhysicalDynamics, made_by: Sequence[Eff
     return {
         name: np.array(found[name], dtype=arrays[name].dtype).reshape(-1, *arrays[name].shape[1:]) for name in found
     }
+
+
+def _more_than_state(env: StandingEnv) -> bool:
+    """Whether observations show more than the state, or steps depend on more: what commands came before."""
+    env.reset(seed=0)
+    env.step(env.action_space.sample())  # what remembers has something to remember now
+    return env.alters_observations or env.remembers
 
 
 def _recovered(dynamics: PhysicalDynamics, observations: np.ndarray) -> list[tuple[int, np.ndarray, np.ndarray]]:

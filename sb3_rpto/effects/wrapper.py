@@ -15,7 +15,7 @@ from gymnasium.utils import EzPickle, RecordConstructorArgs
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.sensors import ago
-from sb3_rpto.effects.simulation import Active, prepare, push, pushing
+from sb3_rpto.effects.simulation import Active, memory, prepare, push, pushing
 from sb3_rpto.effects.world import LiveWorld
 
 # Where gymnasium's MujocoEnv steps its physics, and what an environment without that method may offer instead.
@@ -136,6 +136,11 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         """Whether sensors, of these effects or of those beneath, show something else than the state."""
         return any(layer._sensing for layer in corrections(self))
 
+    @property
+    def remembers(self) -> bool:
+        """Whether the last step depended on commands from before it, by these effects, those beneath, or the model."""
+        return memory(self.unwrapped.model) > 0 or any(any(layer._memory) for layer in corrections(self))  # type: ignore[attr-defined]
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; commands from before it are forgotten."""
         self._memory, self._past = [{} for _ in self._commanding], []
@@ -175,7 +180,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         stack = corrections(self)
         acting = pushing([pair for layer in reversed(stack) for pair in layer._acting])
         commanding = [
-            (*pair, memory) for layer in stack for pair, memory in zip(layer._commanding, layer._memory, strict=True)
+            (*pair, earlier) for layer in stack for pair, earlier in zip(layer._commanding, layer._memory, strict=True)
         ]
         world = LiveWorld(model, data)  # whose restore takes back the substeps' own changes alone
         for effect, _ in acting:
@@ -189,8 +194,8 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             self._past = [(data.qpos.copy(), data.qvel.copy())]
         for _ in range(n_frames):
             sent = command.copy()
-            for effect, x, memory in commanding:
-                sent[effect.ctrl] = effect.command(np.array([sent[effect.ctrl]]), x, memory, dt)[0]
+            for effect, x, earlier in commanding:
+                sent[effect.ctrl] = effect.command(np.array([sent[effect.ctrl]]), x, earlier, dt)[0]
             data.ctrl[:] = sent
             if acting:
                 push(world, acting)
