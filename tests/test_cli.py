@@ -99,7 +99,7 @@ def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixtu
         ({"model": "no_such_package:Nothing-v7"}, "neither a file nor a gymnasium environment"),
         ({"model": "CartPole-v1"}, "no MuJoCo model"),
         ({"options": ["--declare", "hinge.dampng"]}, "damping"),
-        ({"options": ["--candidates", "friction"]}, "coulomb_friction"),
+        ({"options": ["--candidates", "coulomb"]}, "coulomb_friction"),
         ({"options": ["--candidates", ""]}, "--candidates is empty"),
         ({"options": ["--horizon", "-1"]}, "--horizon"),
         ({"options": ["--calibrate", "-1"]}, "--calibrate"),
