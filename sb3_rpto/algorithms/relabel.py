@@ -34,14 +34,16 @@ def relabelled(model: Looping, dynamics: PhysicalDynamics, made_by: Sequence[Eff
     :param model: with D_source
     :param dynamics: the simulator, its effects with their values
     :param made_by: effects of the simulator that made D_source, beside the source itself
-    :return: as :func:`sb3_rpto.buffers.chronological`, oldest first; empty where a step depends on more than the state,
-        as with late motors, or an observation shows something else
+    :return: as :func:`sb3_rpto.buffers.chronological`, oldest first; empty where no step ends an episode, so that a
+        policy that is lost for a while cannot fall, and its own states are worth more; where a step depends on more
+        than the state, as with late motors, or an observation shows something else
     """
     assert model.env is not None
     arrays = {name: values[-MOST:] for name, values in chronological(model.replay_buffer.source).items()}
     before, after = (StandingEnv(copied(model.env), effects) for effects in (made_by, dynamics.effects()))
     actions = model.policy.unscale_action(arrays["actions"])
-    rows = [] if _more_than_state(after) else _recovered(dynamics, arrays["observations"])
+    none = not arrays["terminations"].any() or _more_than_state(after)
+    rows = [] if none else _recovered(dynamics, arrays["observations"])
     before.reset(seed=0)
     earlier: Any = before.unwrapped
     base: Any = after.unwrapped

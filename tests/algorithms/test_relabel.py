@@ -104,6 +104,11 @@ def test_nothing_is_made_where_the_state_is_not_all(effect: Effect) -> None:
     assert again["observations"].shape == (0, 11)
 
 
+def test_nothing_is_made_where_no_step_ends_an_episode() -> None:
+    model, dynamics = made("HalfCheetah-v5")
+    assert len(relabelled(model, dynamics)["actions"]) == 0
+
+
 def test_what_a_corrected_simulator_made_is_not_corrected_twice() -> None:
     model, dynamics = made("Hopper-v5")
     (leg,) = declare(dynamics.model, ["leg.length"])
