@@ -12,10 +12,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.rehearsals import Rehearsals
-from sb3_rpto.algorithms.relabel import relabelled
+from sb3_rpto.algorithms.relabel import outdated, renew_source
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.base import Transitions
-from sb3_rpto.dynamics.onestep import remembered
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Declared, Effect, from_json
 from sb3_rpto.envs.observations import single_env
@@ -46,14 +45,10 @@ NOISY_WINDOW, SHORT_STRETCHES = 6, 0.25
 ENOUGH = 400
 #: What is found is kept when the one-step error falls below this share of the best without it.
 WORTH = 0.9
-#: Source steps that fill D_source anew.
-FILL = 1_000
-#: Then the policy learns in the corrected simulator what it can for nothing, before the next target step: in rounds of
-#: so many source steps, until so many in a row earned no more than the best one and this share of it, or
-#: ``retrain_steps`` are taken. A task that is solved earns a trifle more for ever.
+#: With D_source made anew the policy learns in the corrected simulator what it can for nothing, before the next target
+#: step: in rounds of so many source steps, until so many in a row earned no more than the best one and this share of
+#: it, or ``retrain_steps`` are taken. A task that is solved earns a trifle more for ever.
 ROUND, PATIENCE, RISE = 20_000, 2, 1e-3
-#: Another simulator made D_source where the present one errs by so much on the oldest so many of its transitions.
-OTHER, OLDEST = 0.02, 500
 #: Width of a normal distribution's 95 % interval, in standard deviations.
 WIDTH = 3.92
 #: A corrected simulator must stay finite for so many steps from states of the target, as the uncorrected one does.
@@ -396,34 +391,6 @@ def _from_resets(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
     copy.action_space.seed(0)
     actions = [[copy.action_space.sample() for _ in range(TRIAL_STEPS)] for _ in range(TRIAL_STATES)]
     return observations, np.array(actions)
-
-
-def outdated(model: Looping, dynamics: PhysicalDynamics) -> bool:
-    """Whether D_source holds what another simulator than the present one produced.
-
-    Where the oldest transitions were overwritten, the next ones have lost the commands that late motors still act on.
-    """
-    side, lead = model.replay_buffer.source, 0
-    if side.full:
-        lead = min(remembered(dynamics.model, dynamics.frame_skip) * int(model.source_steps), side.size() // 2)
-    return dynamics.error(model.transitions("source").take(slice(lead + OLDEST)), lead=lead) > OTHER
-
-
-def renew_source(model: Looping, dynamics: PhysicalDynamics, made_by: Sequence[Effect] = ()) -> None:
-    """Simulate again what another simulator produced, and take the first :data:`FILL` steps in the present one.
-
-    They begin with episodes: of one under way the commands before it are dropped too, which late motors still act on.
-
-    :param made_by: effects of the simulator that made D_source so far
-    """
-    assert model._source_world is not None
-    again = relabelled(model, dynamics, made_by)
-    count = len(again["actions"])
-    model.replay_buffer.source.reset()
-    if count:
-        model.replay_buffer.append("source", dones=again.pop("terminations"), **again)
-    model._source_world.begin_anew()
-    model.source_timesteps += count + model._source_world.interact(model, FILL)
 
 
 def learn_for_a_step(model: Looping) -> int:

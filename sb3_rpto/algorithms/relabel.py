@@ -1,4 +1,4 @@
-"""D_source when the simulator was corrected: the same states and actions, with what follows there now."""
+"""D_source when the simulator was corrected: whether it is another's, and its transitions as they are there now."""
 
 from __future__ import annotations
 
@@ -12,16 +12,49 @@ from sb3_rpto.algorithms.looping import Looping
 from sb3_rpto.algorithms.recorded import observe
 from sb3_rpto.algorithms.source import copied
 from sb3_rpto.buffers import chronological
+from sb3_rpto.dynamics.onestep import remembered
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Effect
 from sb3_rpto.effects.stance import StandingEnv, lifted
 
+#: Another simulator made D_source where the present one errs by so much on the oldest so many of its transitions.
+OTHER, OLDEST = 0.02, 500
+#: Source steps that are taken anew.
+FILL = 1_000
 #: Most transitions that are simulated again, the newest.
 MOST = 50_000
 #: How well the state must account for the observation, as a share of the latter and at least.
 SHOWN = 1e-3
 #: A longer body may not be in something: by how much deeper than before, as a share of the model's extent.
 DEEPER = 0.01
+
+
+def outdated(model: Looping, dynamics: PhysicalDynamics) -> bool:
+    """Whether D_source holds what another simulator than the present one produced.
+
+    Where the oldest transitions were overwritten, the next ones have lost the commands that late motors still act on.
+    """
+    side, lead = model.replay_buffer.source, 0
+    if side.full:
+        lead = min(remembered(dynamics.model, dynamics.frame_skip) * int(model.source_steps), side.size() // 2)
+    return dynamics.error(model.transitions("source").take(slice(lead + OLDEST)), lead=lead) > OTHER
+
+
+def renew_source(model: Looping, dynamics: PhysicalDynamics, made_by: Sequence[Effect] = ()) -> None:
+    """Simulate again what another simulator produced, and take the first :data:`FILL` steps in the present one.
+
+    They begin with episodes: of one under way the commands before it are dropped too, which late motors still act on.
+
+    :param made_by: effects of the simulator that made D_source so far
+    """
+    assert model._source_world is not None
+    again = relabelled(model, dynamics, made_by)
+    count = len(again["actions"])
+    model.replay_buffer.source.reset()
+    if count:
+        model.replay_buffer.append("source", dones=again.pop("terminations"), **again)
+    model._source_world.begin_anew()
+    model.source_timesteps += count + model._source_world.interact(model, FILL)
 
 
 def relabelled(model: Looping, dynamics: PhysicalDynamics, made_by: Sequence[Effect] = ()) -> dict[str, np.ndarray]:

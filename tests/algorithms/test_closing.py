@@ -21,9 +21,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPTO, RTO
-from sb3_rpto.algorithms import arguments, closing
-from sb3_rpto.algorithms.closing import LoopCloser, outdated, renew_source, stays_finite
+from sb3_rpto.algorithms import arguments, closing, relabel
+from sb3_rpto.algorithms.closing import LoopCloser, stays_finite
 from sb3_rpto.algorithms.rehearsals import Rehearsals
+from sb3_rpto.algorithms.relabel import outdated, renew_source
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
@@ -58,14 +59,14 @@ def model(lacks: list[Effect], cls: type = RPTO, **kwargs: object) -> RPTO:
 @pytest.fixture
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closing, "FIRST", 80)
-    monkeypatch.setattr(closing, "FILL", 25)
+    monkeypatch.setattr(relabel, "FILL", 25)
 
 
 @cache
 def learned() -> RPTO:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(closing, "FIRST", 80)
-        patch.setattr(closing, "FILL", 25)
+        patch.setattr(relabel, "FILL", 25)
         return model(friction()).learn(100, source_timesteps=100)
 
 
@@ -148,7 +149,7 @@ def learned_from_noise() -> RPTO:
     noise = np.array([3e-4] * 5 + [3e-3] * 3 + [0.0])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(closing, "FIRST", 120)
-        patch.setattr(closing, "FILL", 25)
+        patch.setattr(relabel, "FILL", 25)
         passed = {"observation_noise": noise.tolist()}
         made = model([], target_env=noisy(noise), dynamics_kwargs=passed, close_loop=["coulomb_friction"])
         return made.learn(170, source_timesteps=180)
@@ -247,7 +248,7 @@ def test_what_an_uncorrected_source_produced_is_simulated_again() -> None:
     # The first are those that are simulated again, more than there are fresh steps since the trace at step 80.
     source = made.transitions("source")
     assert len(source) > 100 + 25 + 28 + 4 + 4 * 21
-    assert dynamics(made).error(source.take(slice(100))) < closing.OTHER
+    assert dynamics(made).error(source.take(slice(100))) < relabel.OTHER
 
 
 def test_source_episodes_have_the_effect() -> None:
@@ -359,7 +360,7 @@ def test_data_that_have_lost_their_past_are_not_another_simulators() -> None:
     assert made._source_world is not None
     made._source_world.interact(made, 303)
     assert made.replay_buffer.source.full
-    assert dynamics(made).error(made.transitions("source")) > closing.OTHER  # the oldest commands are gone
+    assert dynamics(made).error(made.transitions("source")) > relabel.OTHER  # the oldest commands are gone
     assert not outdated(made, dynamics(made))
     dynamics(made).adopt([LIBRARY["coulomb_friction"]("slider", level=50.0)])
     assert outdated(made, dynamics(made))
@@ -506,7 +507,7 @@ def test_learning_in_the_corrected_simulator_that_was_interrupted_is_counted_and
     assert made.loop.stale
     before = made.source_timesteps
     monkeypatch.undo()
-    monkeypatch.setattr(closing, "FILL", 25)
+    monkeypatch.setattr(relabel, "FILL", 25)
     made.learn(1, reset_num_timesteps=False)
     assert not made.loop.stale
     assert made.source_timesteps >= before + 25 + 25

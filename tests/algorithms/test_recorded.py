@@ -16,7 +16,7 @@ from conftest import SMALL_ENSEMBLE, SMALL_POLICY
 from stable_baselines3 import SAC
 
 from sb3_rpto import RPTO, RTO
-from sb3_rpto.algorithms import closing
+from sb3_rpto.algorithms import closing, relabel
 from sb3_rpto.algorithms.recorded import transitions
 from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.physical import PhysicalDynamics
@@ -232,7 +232,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def quick(patch: pytest.MonkeyPatch) -> None:
     """Few windows and long steps in time: a trace of some seconds."""
-    patch.setattr(closing, "FILL", 50)
+    patch.setattr(relabel, "FILL", 50)
     patch.setattr(windows, "LONGEST", 0.005)
     patch.setattr(importlib.import_module("sb3_rpto.tracing.prepare"), "FEW", 8)
 
@@ -285,7 +285,7 @@ def test_source_steps_are_counted_and_old_ones_simulated_again() -> None:
     made = learned()
     assert made.num_timesteps == 40
     assert 50 + 40 + 100 < made.replay_buffer.source.size() <= made.source_timesteps
-    assert made.dynamics.error(made.transitions("source").take(slice(100))) < closing.OTHER
+    assert made.dynamics.error(made.transitions("source").take(slice(100))) < relabel.OTHER
 
 
 def test_the_zip_holds_what_was_found_and_not_the_log(tmp_path: Path) -> None:
