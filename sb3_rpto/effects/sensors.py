@@ -14,7 +14,7 @@ def _along(x: np.ndarray, q: np.ndarray) -> np.ndarray:
     return x.reshape(x.shape + (1,) * (q.ndim - x.ndim))
 
 
-def _readers(sensor: Effect, model: mujoco.MjModel) -> np.ndarray:
+def readers(sensor: Effect, model: mujoco.MjModel) -> np.ndarray:
     """The actuators that feed back the sensor's position, kp (u - q) for one, with gear g kp (u - g q)."""
     there = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == sensor.index)
     feedback = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (model.actuator_biasprm[:, 1] != 0)
@@ -79,7 +79,7 @@ class SensorBias(Effect):
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Feed back what is shown."""
-        for i in _readers(self, world.model):
+        for i in readers(self, world.model):
             bias, gear = world.field("actuator_biasprm"), world.field("actuator_gear")
             bias[:, i, 0] += bias[:, i, 1] * gear[:, i, 0] * x[:, 0]
 
@@ -110,5 +110,5 @@ class SensorGain(Effect):
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Feed back what is shown."""
-        for i in _readers(self, world.model):
+        for i in readers(self, world.model):
             world.field("actuator_biasprm")[:, i, 1] *= 1 + x[:, 0]

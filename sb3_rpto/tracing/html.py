@@ -138,9 +138,12 @@ def _model(report: Report) -> str:
 
 
 def _effects(report: Report) -> str:
-    if not report.effects:
-        return _note("No effect was needed or could be named.")
     lines = []
+    if report.zeros is not None:
+        text = "The zeros of these encoders differ from run to run; they are taken off the fitted runs."
+        lines += [f"<p>{text}</p>", _table(["encoder", "spread, rad or m", "in each run"], report.zeros.rows(), (1,))]
+    if not report.effects:
+        return "\n".join([*lines, _note("No effect was needed or could be named.")])
     if report.verdict != "explained":
         lines.append("<p>These bring the model closer to the data. They are <b>not</b> claimed as the explanation.</p>")
     for t in report.effects:

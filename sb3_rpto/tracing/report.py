@@ -20,6 +20,7 @@ from sb3_rpto.tracing.checks import Finding, grouped
 from sb3_rpto.tracing.evaluate import HorizonError
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.residuals import ForceResidual
+from sb3_rpto.tracing.zeros import Zeros, zeros_of
 from sb3_rpto.version import __version__
 
 if TYPE_CHECKING:
@@ -123,6 +124,7 @@ class Report:
     :param residuals_before: the force residuals themselves, an item for each run that is long enough
     :param residuals_after: of the corrected model
     :param findings: all that was found and repaired in the data
+    :param zeros: encoder zeros that differ by run; None where none clearly do
     :param noise: of each position column, rad or m
     :param runs: names of the train, select and test runs
     :param judged_apart: whether adequacy is that on select runs; else on the training runs, which were fitted
@@ -152,6 +154,7 @@ class Report:
     residuals_before: list[ForceResidual]
     residuals_after: list[ForceResidual]
     findings: list[Finding]
+    zeros: Zeros | None
     noise: dict[str, float]
     runs: dict[str, list[str]]
     judged_apart: bool
@@ -176,6 +179,16 @@ class Report:
 
         return apply_effects(env, self.correction)
 
+    def zeros_of(self, data: Measurements) -> Zeros:
+        """The zeros of other runs' encoders by the corrected model: ``report.zeros_of(new).taken_off(new)`` is homed.
+
+        :param data: recordings of the machine, columns in the order of those traced
+        :raises ValueError: no encoder has a zero that differs by run; no episode is as long as a window
+        """
+        if self.zeros is None:
+            raise ValueError("no encoder's zero was found to differ by run; predict the runs as they are")
+        return zeros_of(self.simulation, self.values_after, data, self.sigma, self.horizon, self.zeros.joints)
+
     def __str__(self) -> str:
         means, _ = wording.VERDICTS[self.verdict]
         lines = [f"verdict: {self.verdict}", f"  {means}", "", "model", f"  {self.equation()}"]
@@ -186,6 +199,12 @@ class Report:
         if self.effects:
             claim = "it lacks" if self.verdict == "explained" else "closer to the data with, but not explained by"
             lines += ["", claim, *wording.aligned(self._values(self.effects)), *self._evidence()]
+        if self.zeros is not None:
+            lines += [
+                "",
+                "encoder zeros that differ by run, rad or m: spread, and each",
+                *wording.aligned(self.zeros.rows()),
+            ]
         apart = "on select windows" if self.judged_apart else "on fitted windows, as too few runs are set apart"
         lines += ["", f"adequacy R: error over that of noise alone, {apart}; 1 where nothing is missing"]
         lines += [f"  before {self.adequacy_before}, after {self.adequacy_after}"]
@@ -317,6 +336,7 @@ class Report:
             "force_after": forces(self.force_after),
             "learnable": forces(self.learnable),
             "findings": [vars(f) for f in self.findings],
+            "zeros": self.zeros and self.zeros.to_json(),
             "noise": self.noise,
             "runs": self.runs,
             "judged_apart": self.judged_apart,

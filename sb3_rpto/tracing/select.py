@@ -10,12 +10,12 @@ import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.tracing import concentrate
-from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.concentrate import concentrated, led_on
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds, several_missed
 from sb3_rpto.tracing.identify import Fit, Linear, Problem
 from sb3_rpto.tracing.loss import FAR
-from sb3_rpto.tracing.windows import Windows
+from sb3_rpto.tracing.unseen import unseen_errors
+from sb3_rpto.tracing.windows import Windows, join
 
 #: t*, well above what complete sets need to have nothing named (`benchmark threshold`: at most 2.0 in 30, most 0), as
 #: real noise is not theirs; `calibrate` measures it for the data at hand.
@@ -26,9 +26,6 @@ NEARLY = 10.0
 LIKELY = 2.0
 #: Share of the error that counts there: of the many effects that would fit a little of what lacks, few are named.
 TENTH = 0.1
-#: Windows left out move a parameter as if it were known beforehand to this many plausible sizes, to the power of -2:
-#: what they hardly show, like a tilt that acts to second order, would go astray.
-UNTOLD = 1.0
 #: Iterations of a refit that begins at the larger model's optimum.
 REFIT = 5
 #: Iterations of the joint fit of all candidates.
@@ -126,6 +123,12 @@ class Selector:
     def judging(self) -> Problem:
         """Where adequacy is judged: the select windows, or all where there are none."""
         return self.select or self.train
+
+    def every_window(self) -> Problem:
+        """All windows together, those to fit first."""
+        if self.select is None:
+            return self.train
+        return Problem(self.simulation, join(self.train.windows, self.select.windows), self.train.scales)
 
     def free(self, effects: Sequence[int]) -> np.ndarray:
         """Indices of the parameters of what is known and of the given effects.
@@ -236,24 +239,10 @@ class Selector:
         return self._memory[effects]
 
     def _errors(self, fit: Fit, effects: Sequence[int]) -> np.ndarray:
-        """Errors on windows that the parameters were not fitted to.
-
-        Each fold's parameters are one Gauss-Newton step away from the fit to all training windows, taken with the
-        windows of the fold and beside it left out.
-        """
-        train, free = self.train, self.free(effects)
-        rows = np.tile(fit.values, (len(train.windows), 1))
-        if len(free):
-            linear = train.linear(fit, free)
-            low, high = ((b[free] - fit.values[free]) / train.size[free] for b in (train.lower, train.upper))
-            for others, judged in self.folds:
-                normal, gradient = linear.normal[others].sum(0), linear.gradient[others].sum(0)
-                normal = normal + np.diag(1e-3 * np.diag(normal) + UNTOLD)
-                move = bounded_step(normal, gradient, low, high) * train.size[free]
-                rows[np.ix_(judged, free)] += move
-        errors = train.score(rows, fit.starts, iterations=1).errors
-        unseen = [errors[judged] for _, judged in self.folds]
-        return np.concatenate([*unseen, self.select.score(fit.values).errors] if self.select else unseen)
+        """Errors on windows that the parameters were not fitted to."""
+        errors = unseen_errors(self.train, fit, self.free(effects), self.folds)
+        apart = [self.select.score(fit.values).errors] if self.select else []
+        return np.concatenate([*(errors[judged] for _, judged in self.folds), *apart])
 
     def evidence(self, with_: Model, without: Model) -> Evidence:
         """What ``with_`` gains over ``without`` on windows that neither was fitted to."""

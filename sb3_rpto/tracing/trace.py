@@ -41,7 +41,7 @@ from sb3_rpto.tracing.residuals import learnable_share, summary
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.search import Found, find, worth_a_look
 from sb3_rpto.tracing.select import Selection, Selector
-from sb3_rpto.tracing.windows import Windows
+from sb3_rpto.tracing.zeros import homed, settled, zeros_by_run
 
 #: Verdicts that leave nothing to look for.
 SETTLED = ("complete", "explained")
@@ -95,18 +95,31 @@ def trace(
     _check_arguments(data, seed, candidates, horizon, calibrate, threads)
     say = _steady(progress)
 
-    def searched(simulated: bool) -> tuple[SetUp, Found]:
-        made = prepare(model, data, declared, seed, candidates, horizon, threads, known, simulated)
-        at, finer = partial(made.selectors, say=say), partial(made.finer, say=say)
-        return made, find(at, finer, made.length, made.longer, seed, calibrate)
+    def prepared(simulated: bool) -> SetUp:
+        return prepare(model, data, declared, seed, candidates, horizon, threads, known, simulated)
 
-    set_up, found = searched(simulated)
+    def search(on: SetUp) -> Found:
+        at, finer = partial(on.selectors, say=say), partial(on.finer, say=say)
+        return find(at, finer, on.length, on.longer, seed, calibrate)
+
+    set_up = prepared(simulated)
+    found = search(set_up)
     again = _of_own_steps(set_up, found, declared, threads)
     if again is not None:
-        set_up, found = searched(True)
+        set_up = prepared(True)
+        found = search(set_up)
         set_up.findings.append(again)
-    no_better = not found.after.ratio < found.before.ratio
-    if no_better and judge(found.before, found.after, bool(found.selection.model.effects)) == "unexplained":
+    first, zeros = found, None
+    if judge(found.before, found.after, bool(found.selection.model.effects)) not in SETTLED:
+        say(0.8, "looking for encoder zeros that differ by run")
+        zeros = zeros_by_run(set_up, found)
+    if zeros is not None:
+        set_up = homed(set_up, zeros)
+        set_up, zeros, found = settled(set_up, zeros, search(set_up), say, seed)
+        set_up.findings.append(zeros.finding())
+    named = bool(found.selection.model.effects) or zeros is not None
+    no_better = not found.after.ratio < first.before.ratio
+    if no_better and judge(first.before, found.after, named) == "unexplained":
         found = replace(found, selection=Selection(found.base), after=found.before)  # it is no hint either
     sigma, fitted = set_up.sigma, set_up.fitted
     selector, selection = found.on.fine, found.selection
@@ -124,11 +137,11 @@ def trace(
         findings.append(Finding("split", "training runs", message))
 
     say(0.85, "fitting the final model")
-    parts = [p.windows for p in (selector.train, selector.select) if p is not None]
-    problem = Problem(simulation, parts[0] if len(parts) == 1 else join(*parts), set_up.scales)
+    problem = selector.every_window()
     final, intervals = refit(selection, problem)
-    # Both models are fitted to the same data before they are compared on the test runs.
-    before = problem.fit(found.base.fit.values, selector.free(()), iterations=FINAL, crude=0.0)
+    # Both models are fitted to all these data before they are compared on the test runs, the declared one as recorded.
+    recorded = problem if zeros is None else first.on.fine.every_window()
+    before = recorded.fit(first.base.fit.values, selector.free(()), iterations=FINAL, crude=0.0)
 
     say(0.9, "predicting the test runs")
     data = set_up.test if set_up.test.episodes else fitted
@@ -144,7 +157,7 @@ def trace(
     residuals_after = [] if tied else missing_forces(simulation, final, data)
     unknown = np.full(simulation.model.nv, np.nan)  # where all runs are too short to differentiate
     rounding = data.exact and found.after.adequate  # is all that is left
-    verdict = judge(found.before, found.after, bool(selection.model.effects))
+    verdict = judge(first.before, found.after, named)
     floor = noise_floor(simulation, final, data, sigma, seed)
     if verdict in SETTLED:
         findings += missed(simulation, final, set_up.test, sigma, seed)
@@ -175,7 +188,7 @@ def trace(
         declared=_declared(simulation, final, intervals),
         effects=kept,
         candidates=_fates(selector, found.screening, selection),
-        adequacy_before=found.before,
+        adequacy_before=first.before,
         adequacy_after=found.after,
         before=errors_before,
         after=errors_after,
@@ -186,6 +199,7 @@ def trace(
         residuals_before=residuals_before,
         residuals_after=residuals_after,
         findings=findings,
+        zeros=zeros,
         noise=dict(zip(data.columns.qpos, sigma.tolist())),
         runs={
             name: sorted({e.run for e in part.episodes})
@@ -259,35 +273,6 @@ def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarra
         intervals = np.clip(intervals, problem.lower, problem.upper)
         intervals[:, hidden] = np.nan
     return values, intervals
-
-
-def join(a: Windows, b: Windows) -> Windows:
-    """All windows of both, as blocks of their own."""
-    columns = max(a.at.shape[1], b.at.shape[1])
-
-    def pad(values: np.ndarray) -> np.ndarray:
-        return np.pad(values, [(0, 0), (0, columns - values.shape[1])] + [(0, 0)] * (values.ndim - 2))
-
-    def both(name: str) -> np.ndarray:
-        return np.concatenate([getattr(a, name), getattr(b, name)])
-
-    enabled = None
-    if a.drive.enabled is not None or b.drive.enabled is not None:
-        parts = [
-            w.drive.enabled if w.drive.enabled is not None else np.ones_like(w.drive.commands[:, w.drive.before :])
-            for w in (a, b)
-        ]
-        enabled = np.concatenate(parts)
-    drive = a.drive._replace(
-        commands=np.concatenate([a.drive.commands, b.drive.commands]),
-        enabled=enabled,
-        settings={k: np.concatenate([v, b.drive.settings[k]]) for k, v in a.drive.settings.items()},
-    )
-    arrays: dict[str, Any] = {n: both(n) for n in ("qpos", "qvel", "qacc", "spread", "time")}
-    arrays |= {n: np.concatenate([pad(getattr(w, n)) for w in (a, b)]) for n in ("at", "measured", "usable")}
-    for name in ("block", "episode"):  # each its own
-        arrays[name] = np.concatenate([getattr(a, name), getattr(b, name) + getattr(a, name).max() + 1])
-    return replace(a, drive=drive, **arrays)
 
 
 def judge(before: Adequacy, after: Adequacy, named: bool) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -299,6 +300,35 @@ def _build(
         data.touching,
         data.noise is not None,
     )
+
+
+def join(a: Windows, b: Windows) -> Windows:
+    """All windows of both, as blocks of their own."""
+    columns = max(a.at.shape[1], b.at.shape[1])
+
+    def pad(values: np.ndarray) -> np.ndarray:
+        return np.pad(values, [(0, 0), (0, columns - values.shape[1])] + [(0, 0)] * (values.ndim - 2))
+
+    def both(name: str) -> np.ndarray:
+        return np.concatenate([getattr(a, name), getattr(b, name)])
+
+    enabled = None
+    if a.drive.enabled is not None or b.drive.enabled is not None:
+        parts = [
+            w.drive.enabled if w.drive.enabled is not None else np.ones_like(w.drive.commands[:, w.drive.before :])
+            for w in (a, b)
+        ]
+        enabled = np.concatenate(parts)
+    drive = a.drive._replace(
+        commands=np.concatenate([a.drive.commands, b.drive.commands]),
+        enabled=enabled,
+        settings={k: np.concatenate([v, b.drive.settings[k]]) for k, v in a.drive.settings.items()},
+    )
+    arrays: dict[str, Any] = {n: both(n) for n in ("qpos", "qvel", "qacc", "spread", "time")}
+    arrays |= {n: np.concatenate([pad(getattr(w, n)) for w in (a, b)]) for n in ("at", "measured", "usable")}
+    for name in ("block", "episode"):  # each its own
+        arrays[name] = np.concatenate([getattr(a, name), getattr(b, name) + getattr(a, name).max() + 1])
+    return replace(a, drive=drive, **arrays)
 
 
 def block_length(data: Measurements, horizon: float) -> float:

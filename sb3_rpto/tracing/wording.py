@@ -21,13 +21,13 @@ VERDICTS = {
         "This holds for motion like the recorded one. Effects that these data cannot show may still be there.",
     ),
     "explained": (
-        "The model lacked the effects below; with them, what is left is no more than the measurement noise.",
+        "The model lacked what is named below; with it, what is left is no more than the measurement noise.",
         "Effects of one class act alike in these data: any of them may be the true one.",
     ),
     "partly explained": (
-        "The effects below take away at least half of the excess error, but something remains that none of the effects "
-        "looked for explains.",
-        "They bring the model closer to the data and are not claimed as the explanation.",
+        "What is named below takes away at least half of the excess error, but something remains that none of the "
+        "effects looked for explains.",
+        "It brings the model closer to the data and is not claimed as the explanation.",
     ),
     "unexplained": (
         "The model does not fit the data, and none of the effects looked for explains why.",
