@@ -13,6 +13,7 @@ import csv
 import json
 import platform
 import time
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -22,6 +23,7 @@ import numpy as np
 from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.machines import MACHINES, Machine, find_measured
 from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, predictions
 from sb3_rpto.tracing.windows import cut
 
@@ -29,6 +31,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 RESULTS = Path("examples/results/machines")
+#: Arrays of an episode that have an item for each sample.
+SAMPLED = ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")
 
 
 def rows(name: str, data: str, model: str, errors: list[HorizonError]) -> list[dict[str, object]]:
@@ -61,10 +65,40 @@ def study(machine: Machine, out: Path, seed: int) -> tuple[list[dict[str, object
         for label, values in (("declared", report.values_before), ("corrected", report.values_after)):
             errors = horizon_errors(report.simulation, values, machine.other, report.sigma, seed)
             found += rows(machine.name, "other", label, errors)
+    found += homed(machine, report, seed)
     draw(machine, report)
-    keys = ("verdict", "declared", "effects", "adequacy_before", "adequacy_after")
+    keys = ("verdict", "declared", "effects", "zeros", "adequacy_before", "adequacy_after")
     kept = {key: report.to_json()[key] for key in keys}
     return found, {**kept, "seconds": round(seconds), "runs": report.runs, "horizon": report.horizon}
+
+
+def halves(data: Measurements) -> tuple[Measurements, Measurements]:
+    """The first and the second half of each run."""
+    parts: tuple[list[Episode], list[Episode]] = ([], [])
+    for e in data.episodes:
+        middle = len(e) // 2
+        for part, samples, later in zip(parts, (slice(middle), slice(middle, None)), (e.after_gap, True)):
+            arrays = {k: getattr(e, k)[samples] for k in SAMPLED}
+            part.append(replace(e, after_gap=later, **arrays))
+    return replace(data, episodes=parts[0]), replace(data, episodes=parts[1])
+
+
+def homed(machine: Machine, report: Report, seed: int) -> list[dict[str, object]]:
+    """Errors on the second halves of runs whose encoders' zeros the corrected model tells from the first halves."""
+    found: list[dict[str, object]] = []
+    for what, data in (("test", report.data), ("other", machine.other)):
+        if data is None or report.zeros is None:
+            continue
+        first, second = halves(data)
+        models = (
+            ("declared", report.values_before, second),
+            ("corrected", report.values_after, second),
+            ("corrected, homed", report.values_after, report.zeros_of(first).taken_off(second)),
+        )
+        for label, values, runs in models:
+            errors = horizon_errors(report.simulation, values, runs, report.sigma, seed)
+            found += rows(machine.name, f"{what}, second half", label, errors)
+    return found
 
 
 def draw(machine: Machine, report: Report, horizon: float = 1.0) -> None:

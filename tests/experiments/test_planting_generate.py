@@ -81,6 +81,15 @@ def test_noise_quantum_and_velocity():
     assert coarse.measurements.columns.missing == ("hinge",)
 
 
+def test_each_episode_has_encoders_with_zeros_of_their_own():
+    planted = generate("double_pendulum", None, 0, noise=0.0, zeros=0.05, **SHORT)
+    shown = np.stack([e.qpos for e in planted.measurements.episodes]) - planted.truth.qpos
+    np.testing.assert_allclose(shown, np.broadcast_to(planted.truth.zeros[:, None], shown.shape), atol=1e-12)
+    assert len(np.unique(planted.truth.zeros)) == planted.truth.zeros.size
+    with pytest.raises(ValueError, match="zeros is -1"):
+        generate("pendulum", None, 0, zeros=-1, **SHORT)
+
+
 def test_jittered_clock_is_recorded_truly():
     planted = generate("pendulum", None, 0, noise=0.0, jitter=0.4, **SHORT)
     assert {f.kind for f in planted.measurements.findings} == {"jitter"}

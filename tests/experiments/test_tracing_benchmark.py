@@ -34,10 +34,10 @@ def test_design_has_the_counts_and_is_always_the_same():
     assert cases == design("full")
     assert fingerprint(cases) == fingerprint(design("full")) != fingerprint(cases[1:])
     groups = Counter(case.group for case in cases)
-    assert groups == dict(zip(groups, (40, 105, 20, 15, 10, 15)))
-    assert len(cases) == 205
-    assert len(CASES) == 205, "ids are unique"
-    assert len({case.seed for case in cases}) == 205
+    assert groups == dict(zip(groups, (40, 105, 20, 15, 10, 15, 10)))
+    assert len(cases) == 215
+    assert len(CASES) == 215, "ids are unique"
+    assert len({case.seed for case in cases}) == 215
     noises = Counter(case.noise for case in cases if case.group == "single")
     assert noises == {1e-3: 63, 5e-3: 42}
     single = Counter(case.effects[0] for case in cases if case.group == "single")

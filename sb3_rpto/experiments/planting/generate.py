@@ -30,6 +30,7 @@ class Truth:
     :param explainable: whether all effects are of the tracer's library; a complete model is
     :param qpos: positions without sensor effects and noise in rad or m, shape (episodes, T, n)
     :param qvel: velocities likewise
+    :param zeros: what each episode's encoders show beyond that in rad or m, shape (episodes, n)
     """
 
     effects: dict[str, dict[str, float]]
@@ -38,6 +39,7 @@ class Truth:
     explainable: bool
     qpos: np.ndarray
     qvel: np.ndarray
+    zeros: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ def generate(
     jitter: float = 0.0,
     quantum: float = 0.0,
     velocity: bool = True,
+    zeros: float = 0.0,
 ) -> Planted:
     """Simulate a machine whose declared parameters are off by up to 15 % and that has undeclared effects.
 
@@ -83,6 +86,7 @@ def generate(
     :param jitter: sample times are off their grid by up to half this fraction of the interval, in [0, 1)
     :param quantum: of the position's encoder in rad or m, 0 for none
     :param velocity: whether the velocity is recorded
+    :param zeros: standard deviation of the encoders' zeros over the episodes in rad or m, >= 0
     :raises ValueError: unknown names, an effect twice or without a place, or a setting out of range
     """
     if isinstance(system, str):
@@ -96,6 +100,7 @@ def generate(
         ("noise", noise, noise >= 0),
         ("jitter", jitter, 0 <= jitter < 1),
         ("quantum", quantum, quantum >= 0),
+        ("zeros", zeros, zeros >= 0),
     ):
         if not ok:
             raise ValueError(f"{name} is {value}; see the ranges in the documentation of generate")
@@ -104,8 +109,8 @@ def generate(
     if len(set(kinds)) < len(kinds):
         raise ValueError(f"effects are {kinds}; plant each kind once")
     plants.sort(key=lambda plant: list(KINDS).index(plant.kind))
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5)]
-    for_declared, for_times, for_excitation, for_noise, for_effects = streams
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(6)]
+    for_declared, for_times, for_excitation, for_noise, for_effects, for_zeros = streams
 
     factors = for_declared.uniform(1 - SPREAD, 1 + SPREAD, len(system.declared))
     declared = {name: value * float(f) for (name, value), f in zip(system.declared.items(), factors)}
@@ -113,6 +118,7 @@ def generate(
     times = np.arange(samples) / rate + jitter / rate * for_times.uniform(-0.5, 0.5, (episodes, samples))
     times -= times[:, :1]
     excitation = Excitation(system, times, for_excitation)
+    offsets = zeros * for_zeros.standard_normal((episodes, n))
     errors = (
         noise
         * for_noise.standard_normal((2, samples, episodes, n))
@@ -128,6 +134,7 @@ def generate(
     for k in range(samples):
         truth[:, :, k] = simulation.q, simulation.qd
         q, qd = np.array(simulation.sense()) + errors[:, k]
+        q = q + offsets
         if quantum:
             q = quantum * np.round(q / quantum)
         measured[:, :, k] = q, qd
@@ -151,6 +158,7 @@ def generate(
             explainable=all(plant.library for plant in plants),
             qpos=truth[0],
             qvel=truth[1],
+            zeros=offsets,
         ),
     )
 

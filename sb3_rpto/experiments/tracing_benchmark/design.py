@@ -1,4 +1,4 @@
-"""Which sets are generated and traced: a fixed fractional design of 205, of which the quick one is a part.
+"""Which sets are generated and traced: a fixed fractional design of 215, of which the quick one is a part.
 
 =============  =====  ==================================================================================================
 group          cases  what is in the machine
@@ -9,6 +9,7 @@ pair              20  two effects
 outside           15  what no effect of the library can explain
 not excited       10  an effect that the motion does not show
 own classes       15  one effect, simulated by MuJoCo and the effect classes of the package rather than by NumPy
+run zeros         10  encoders whose zeros differ from episode to episode, alone and beside an effect
 =============  =====  ==================================================================================================
 """
 
@@ -24,13 +25,15 @@ from sb3_rpto.experiments.planting import KINDS, SYSTEMS, places
 from sb3_rpto.experiments.tracing_benchmark.own import OWN, UNSEEN
 
 SCALES = ("quick", "full")
-GROUPS = ("complete", "single", "pair", "outside", "not excited", "own classes")
+GROUPS = ("complete", "single", "pair", "outside", "not excited", "own classes", "run zeros")
 RATE, EPISODES, DURATION = 250.0, 10, 4.0
 """Samples a second (each lasts two of the models' timesteps of 2 ms), episodes, and their length in s."""
 LOW, HIGH = 1e-3, 5e-3
 """Noise of the positions in rad or m."""
 ENCODER = 0.0015
 """Step of a coarse encoder in rad or m, about 12 bits a turn."""
+ZEROS = 0.02
+"""Standard deviation of the encoders' zeros over the episodes of the last group, in rad or m."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "plain": {},
     "jitter": {"jitter": 0.3},
@@ -50,7 +53,7 @@ PAIRS = (
     ("command_delay", "asymmetric_damping"),
     ("command_gain", "position_friction"),
 )
-_EVERY = {"complete": 12, "single": 14, "pair": 10, "outside": 8, "not excited": 6, "own classes": 8}
+_EVERY = {"complete": 12, "single": 14, "pair": 10, "outside": 8, "not excited": 6, "own classes": 8, "run zeros": 7}
 _SEED = 50_000  # of sets that the tracer was not developed on
 
 
@@ -68,6 +71,7 @@ class Case:
     :param jitter: of the sample times, as a fraction of their interval
     :param quantum: of the encoder in rad or m, 0 for none
     :param velocity: whether the velocity is recorded
+    :param zeros: standard deviation of the encoders' zeros over the episodes in rad or m
     """
 
     id: str
@@ -80,22 +84,23 @@ class Case:
     jitter: float = 0.0
     quantum: float = 0.0
     velocity: bool = True
+    zeros: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
-        """All fields in types of JSON."""
+        """All fields in types of JSON, those that came later only where they are set: older results stay."""
         found: dict[str, Any] = json.loads(json.dumps(asdict(self)))
-        return found
+        return found if self.zeros else {k: v for k, v in found.items() if k != "zeros"}
 
 
 def design(scale: str) -> list[Case]:
     """The cases, always the same.
 
-    :param scale: ``"full"`` (205) or ``"quick"`` (20 of them)
+    :param scale: ``"full"`` (215) or ``"quick"`` (20 of them)
     :raises ValueError: another scale
     """
     if scale not in SCALES:
         raise ValueError(f"scale is {scale!r}; use one of {', '.join(SCALES)}")
-    groups = [_complete(), _single(), _pairs(), _outside(), _not_excited(), _own()]
+    groups = [_complete(), _single(), _pairs(), _outside(), _not_excited(), _own(), _run_zeros()]
     if scale == "quick":
         groups = [cases[:: _EVERY[cases[0].group]] for cases in groups]
     return [case for cases in groups for case in cases]
@@ -175,3 +180,10 @@ def _own() -> list[Case]:
         _case("own classes", i, p.machine, [(p.kind, "own")], planted_by="effects", noise=HIGH if i % 3 == 2 else LOW)
         for i, p in enumerate(OWN)
     ]
+
+
+def _run_zeros() -> list[Case]:
+    beside = ("coulomb_friction", "quadratic_drag", "stribeck_friction", "command_delay", "armature")
+    planted: list[tuple[str, tuple[tuple[str, str], ...]]] = [(system, ()) for system in SYSTEMS]
+    planted += [(system, ((kind, "large"),)) for system, kind in zip(SYSTEMS, beside)]
+    return [_case("run zeros", i, system, effects, zeros=ZEROS) for i, (system, effects) in enumerate(planted)]

@@ -145,6 +145,8 @@ def examine(case: Case, episodes: int | None = None, duration: float | None = No
         "candidates": {c.label: c.status for c in report.candidates},
         "ratio_before": report.adequacy_before.ratio,
         "ratio_after": report.adequacy_after.ratio,
+        "zeros": found["zeros"],
+        "true_zeros": made.zeros,
         "noise": found["noise"],
         "threshold": report.threshold,
         "errors": errors | {"true": _at_horizon(true)},

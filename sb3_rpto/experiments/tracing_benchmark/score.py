@@ -33,6 +33,7 @@ MEASURES = {
     "listed": "nothing is named, and the effect is listed as not excited or the model found complete",
     "not explained": "the verdict is not explained",
     "says so": "the verdict is unexplained or partly explained",
+    "zeros": "zeros that differ are found, and each within a quarter of their spread, but for what all have in common",
 }
 _FOUND = ("right class", "planted named", "itself", "values", "intervals", "error reduction", "says explained")
 APPLY = {
@@ -42,6 +43,7 @@ APPLY = {
     "outside": ("not explained", "says so"),
     "not excited": ("nothing named", "listed"),
     "own classes": _FOUND,
+    "run zeros": ("zeros", "right class", "says explained"),
 }
 """Measures of each group; the first one decides whether a case passes."""
 
@@ -161,6 +163,7 @@ def judge(result: Result) -> Row:
         "listed": not named and (verdict == "complete" or status == ["not excited"] * len(status)),
         "not explained": verdict != "explained",
         "says so": verdict in ("unexplained", "partly explained"),
+        "zeros": _zeros(result),
     }
     return Row(
         case,
@@ -241,6 +244,17 @@ def _reduction(result: Result) -> float | None:
         for name in ("before", "after", "true")
     )
     return (before - after) / (before - true) if before - true > WORTH * before else None
+
+
+def _zeros(result: Result) -> bool:
+    """Whether zeros of single runs are told from each other as well as :data:`MEASURES` says."""
+    found = (result.get("zeros") or {}).get("offsets", {})
+    off = []
+    for joint, each in found.items():
+        true = np.array([result["true_zeros"][joint][int(run)] for run in each])
+        wrong = np.array(list(each.values())) - true
+        off.append(float(np.abs(wrong - wrong.mean()).max() / true.std()))
+    return bool(off) and max(off) <= WITHIN
 
 
 def _why(case: dict[str, Any], verdict: str, missed: Sequence[str], extra: Sequence[str]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -96,6 +96,7 @@ class Set:
     :param declared: likewise
     :param planted: labels of what is in it
     :param effects: the same as effects of the library; empty where one is outside of it
+    :param zeros: what each joint's encoder shows beyond the truth in each episode, rad or m
     """
 
     model: Any
@@ -103,6 +104,7 @@ class Set:
     declared: tuple[str, ...]
     planted: tuple[str, ...]
     effects: tuple[Effect, ...]
+    zeros: dict[str, list[float]] = field(default_factory=dict)
 
 
 def make(case: Case, episodes: int = EPISODES, duration: float = DURATION) -> Set:
@@ -127,6 +129,7 @@ def make(case: Case, episodes: int = EPISODES, duration: float = DURATION) -> Se
         jitter=case.jitter,
         quantum=case.quantum,
         velocity=case.velocity,
+        zeros=case.zeros,
     )
     effects = [as_effect(system, plant) for plant in plants if plant.library]
     labels = [e.label for e in effects] + [f"{p.kind}({system.links[p.joint].motor})" for p in plants if not p.library]
@@ -136,6 +139,7 @@ def make(case: Case, episodes: int = EPISODES, duration: float = DURATION) -> Se
         planted.declared,
         tuple(labels),
         tuple(effects) if planted.truth.explainable else (),
+        {joint: column.tolist() for joint, column in zip(system.joints, planted.truth.zeros.T)},
     )
 
 
