@@ -112,7 +112,7 @@ def trace(
     first, zeros = found, None
     if judge(found.before, found.after, bool(found.selection.model.effects)) not in SETTLED:
         say(0.8, "looking for encoder zeros that differ by run")
-        zeros = zeros_by_run(set_up, found)
+        zeros = zeros_by_run(set_up, found, say)
     if zeros is not None:
         set_up = homed(set_up, zeros)
         set_up, zeros, found = settled(set_up, zeros, search(set_up), say, seed)

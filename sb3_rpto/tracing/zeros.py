@@ -131,7 +131,7 @@ class Homing(Problem):
         return r, jt, jx
 
 
-def zeros_by_run(set_up: SetUp, found: Found) -> Zeros | None:
+def zeros_by_run(set_up: SetUp, found: Found, say: Progress) -> Zeros | None:
     """The encoders whose zeros clearly differ from run to run, beside what a search has found; None where none do.
 
     Looked for where a bias of the sensor is, and in runs of a machine: a simulator has one zero. Not where a servo
@@ -139,6 +139,7 @@ def zeros_by_run(set_up: SetUp, found: Found) -> Zeros | None:
 
     :param set_up: recordings
     :param found: by the search on them
+    :param say: progress
     """
     data, simulation = set_up.fitted, found.on.fine.simulation
     seen = set(found.on.fine.train.windows.columns.tolist())
@@ -149,7 +150,7 @@ def zeros_by_run(set_up: SetUp, found: Found) -> Zeros | None:
     ]
     if data.exact or data.simulated or len(_runs(set_up)) < 2 or not joints:
         return None
-    homing = _homing(set_up, found, joints)
+    homing = _homing(set_up, found, joints, say)
     if np.median(np.bincount(homing.run)) < LEAST:
         return None
     kept, evidence, values = _differing(homing, found)
@@ -209,7 +210,7 @@ def settled(set_up: SetUp, zeros: Zeros, found: Found, say: Progress, seed: int)
     :param seed: of the resampling
     :return: recordings with the new zeros taken off, these, and what was found with its fit to them
     """
-    homing, selector, model = _homing(set_up, found, zeros.joints), found.on.fine, found.selection.model
+    homing, selector, model = _homing(set_up, found, zeros.joints, say), found.on.fine, found.selection.model
     fit = homing.fit(homing.begin(model.fit.values), _free(homing, found, range(len(zeros.joints))))
     further = replace(zeros, offsets=_offsets(homing, fit.values, found))
     values = fit.values[: homing.common].copy()
@@ -275,9 +276,11 @@ def _runs(set_up: SetUp) -> tuple[str, ...]:
     return tuple(dict.fromkeys(e.run for e in set_up.fitted.episodes))
 
 
-def _homing(set_up: SetUp, found: Found, joints: Sequence[str]) -> Homing:
-    """Windows and model that a search ended with, and the encoders of some joints."""
+def _homing(set_up: SetUp, found: Found, joints: Sequence[str], say: Progress) -> Homing:
+    """Windows and model that a search ended with, and the encoders of some joints; in the usual steps in time."""
     selector, runs = found.on.fine, _runs(set_up)
+    if selector.simulation is not set_up.fine:  # zeros show in kinks no more than elsewhere
+        selector = set_up.selectors(selector.horizon, say).fine
     episodes = [set_up.fitted.episodes[i] for i in selector.train.windows.episode]
     if selector.select is not None:
         episodes += [set_up.select.episodes[i] for i in selector.select.windows.episode]
