@@ -141,6 +141,9 @@ def _add_trace(commands: Commands) -> None:
         help="set the threshold from N data sets simulated from the fitted model (slow; default: as shipped)",
     )
     parser.add_argument(
+        "--threads", metavar="N", type=int, default=0, help="that simulate (default: one for each core)"
+    )
+    parser.add_argument(
         "--simulated",
         action="store_true",
         help="the recordings are of MODEL's own simulator, in its steps in time (default: found out; being told saves "
@@ -168,6 +171,8 @@ def _trace(parsed: argparse.Namespace) -> int:
         raise ValueError("--candidates is empty; name kinds of effects, or leave it out to look for all")
     if parsed.calibrate < 0:
         raise ValueError(f"--calibrate is {parsed.calibrate}; give a number of data sets, or 0 for none")
+    if parsed.threads < 0:
+        raise ValueError(f"--threads is {parsed.threads}; give a number from 1, or 0 for one for each core")
     check_file(parsed.known, "--known")
     if parsed.out.exists() and not parsed.out.is_dir():
         raise ValueError(f"--out {parsed.out} is a file; give a folder")
@@ -194,6 +199,7 @@ def _trace(parsed: argparse.Namespace) -> int:
             candidates=parsed.candidates,
             horizon=parsed.horizon,
             calibrate=parsed.calibrate,
+            threads=parsed.threads,
             simulated=parsed.simulated,
             progress=progress,
         )

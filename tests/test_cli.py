@@ -103,6 +103,7 @@ def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixtu
         ({"options": ["--candidates", ""]}, "--candidates is empty"),
         ({"options": ["--horizon", "-1"]}, "--horizon"),
         ({"options": ["--calibrate", "-1"]}, "--calibrate"),
+        ({"options": ["--threads", "-1"]}, "--threads"),
         ({"options": ["--seed", "one"]}, "sb3-rpto trace --help"),
     ],
 )
