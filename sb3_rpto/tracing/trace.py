@@ -41,7 +41,7 @@ from sb3_rpto.tracing.residuals import learnable_share, summary
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.search import Found, find, worth_a_look
 from sb3_rpto.tracing.select import Selection, Selector
-from sb3_rpto.tracing.zeros import homed, settled, zeros_by_run
+from sb3_rpto.tracing.zeros import as_fitted, homed, settled, zeros_by_run
 
 #: Verdicts that leave nothing to look for.
 SETTLED = ("complete", "explained")
@@ -110,7 +110,8 @@ def trace(
         found = search(set_up)
         set_up.findings.append(again)
     first, zeros = found, None
-    if judge(found.before, found.after, bool(found.selection.model.effects)) not in SETTLED:
+    settled_so = judge(found.before, found.after, bool(found.selection.model.effects)) in SETTLED
+    if not (settled_so and as_fitted(found, seed).adequate):  # few select runs may have zeros like each other's
         say(0.8, "looking for encoder zeros that differ by run")
         zeros = zeros_by_run(set_up, found, say)
     if zeros is not None:

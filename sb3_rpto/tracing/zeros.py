@@ -12,6 +12,7 @@ from scipy.stats import t as student
 from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.effects.sensors import readers
 from sb3_rpto.tracing import wording
+from sb3_rpto.tracing.adequacy import Adequacy, adequacy
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit, Problem
@@ -129,6 +130,12 @@ class Homing(Problem):
                 there = self.run == run
                 jt[there, :, i] = found[there][:, :, np.searchsorted(moved, self.bias[joint])]
         return r, jt, jx
+
+
+def as_fitted(found: Found, seed: int) -> Adequacy:
+    """The adequacy of a model on the windows that it was fitted to."""
+    train = found.on.fine.train
+    return adequacy(train, train.score(found.selection.model.fit.values), seed)
 
 
 def zeros_by_run(set_up: SetUp, found: Found, say: Progress) -> Zeros | None:
