@@ -18,7 +18,7 @@ NAME = "sb3-rpto benchmark tracing"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of :func:`run_benchmark`."""
     parser.add_argument("--out", metavar="DIR", help="folder for the table; results go to DIR/cases")
-    parser.add_argument("--scale", choices=SCALES, default="quick", help="20 or 205 sets (default: quick)")
+    parser.add_argument("--scale", choices=SCALES, default="quick", help="22 or 215 sets (default: quick)")
     parser.add_argument("--workers", metavar="N", type=int, help="processes, of one thread each (default: one a core)")
     parser.add_argument("--only", metavar="REGEX", help="only sets whose id matches somewhere, e.g. '^single-.*1mrad'")
     parser.add_argument("--fresh", action="store_true", help="trace again what has a result already")

@@ -95,7 +95,7 @@ class Case:
 def design(scale: str) -> list[Case]:
     """The cases, always the same.
 
-    :param scale: ``"full"`` (215) or ``"quick"`` (20 of them)
+    :param scale: ``"full"`` (215) or ``"quick"`` (22 of them)
     :raises ValueError: another scale
     """
     if scale not in SCALES:
