@@ -49,7 +49,7 @@ class Zeros:
 
     def rows(self) -> list[list[str]]:
         """A row for each joint: its name, how far its zeros scatter, and those of single runs."""
-        spread = self.offsets.std(axis=0, ddof=1)
+        spread = self.offsets.std(axis=0, ddof=min(1, len(self.runs) - 1))
         each = (", ".join(f"{run} {x:+.3g}" for run, x in zip(self.runs, column)) for column in self.offsets.T)
         return [[joint, wording.number(s, 3), runs] for joint, s, runs in zip(self.joints, spread, each)]
 
@@ -90,13 +90,13 @@ class Homing(Problem):
 
     :param problem: windows, and a simulation with sensor biases among its effects
     :param run: number of each window's run, (W,)
+    :param count: of the runs; those without windows have no zeros that differ
     :param bias: indices of the parameters of the biases, (J,)
     """
 
-    def __init__(self, problem: Problem, run: np.ndarray, bias: np.ndarray) -> None:
+    def __init__(self, problem: Problem, run: np.ndarray, count: int, bias: np.ndarray) -> None:
         super().__init__(problem.simulation, problem.windows, problem.scales)
         self.run, self.bias, self.common = run, bias, len(self.size)
-        count = run.max() + 1
         #: (R, J) indices of the zeros
         self.own = self.common + np.arange(count * len(bias)).reshape(count, len(bias))
         every = np.concatenate([np.arange(self.common), np.tile(bias, count)])
@@ -128,7 +128,7 @@ class Homing(Problem):
             else:
                 run, joint = divmod(parameter - self.common, len(self.bias))
                 there = self.run == run
-                jt[there, :, i] = found[there][:, :, np.searchsorted(moved, self.bias[joint])]
+                jt[there, :, i] = found[there, :, np.searchsorted(moved, self.bias[joint])]
         return r, jt, jx
 
 
@@ -163,11 +163,12 @@ def zeros_by_run(set_up: SetUp, found: Found, say: Progress) -> Zeros | None:
     kept, evidence, values = _differing(homing, found)
     if not kept:
         return None
-    offsets = _offsets(homing, values, found)[:, kept]
+    there = np.unique(homing.run)
+    offsets = _offsets(homing, values, found)[there][:, kept]
     mean, spread = offsets.mean(axis=0), offsets.std(axis=0, ddof=1) / np.sqrt(len(offsets))
     common = np.abs(mean) > student.ppf(0.975, len(offsets) - 1) * spread
-    names, offsets = tuple(joints[j] for j in kept), offsets - np.where(common, mean, 0.0)
-    return Zeros(names, _runs(set_up), offsets, evidence.gain, float(evidence.t))
+    names, runs = tuple(joints[j] for j in kept), tuple(_runs(set_up)[r] for r in there)
+    return Zeros(names, runs, offsets - np.where(common, mean, 0.0), evidence.gain, float(evidence.t))
 
 
 def zeros_of(
@@ -191,9 +192,8 @@ def zeros_of(
     windows = cut(simulation.model, data, sigma, horizon, TRAIN + SELECT)
     names = tuple(dict.fromkeys(data.episodes[i].run for i in windows.episode))
     run = np.array([names.index(data.episodes[i].run) for i in windows.episode])
-    homing = Homing(
-        Problem(simulation, windows, [Scales()] * len(simulation.effects)), run, _biases(simulation, joints)
-    )
+    problem = Problem(simulation, windows, [Scales()] * len(simulation.effects))
+    homing = Homing(problem, run, len(names), _biases(simulation, joints))
     fit = homing.fit(homing.begin(values), homing.own.ravel())
     saved = 1 - float(np.median(fit.errors) / np.median(homing.score(homing.begin(values)).errors))
     return Zeros(tuple(joints), names, fit.values[homing.own], saved, np.nan)
@@ -219,7 +219,7 @@ def settled(set_up: SetUp, zeros: Zeros, found: Found, say: Progress, seed: int)
     """
     homing, selector, model = _homing(set_up, found, zeros.joints, say), found.on.fine, found.selection.model
     fit = homing.fit(homing.begin(model.fit.values), _free(homing, found, range(len(zeros.joints))))
-    further = replace(zeros, offsets=_offsets(homing, fit.values, found))
+    further = replace(zeros, offsets=_offsets(homing, fit.values, found)[[_runs(set_up).index(r) for r in zeros.runs]])
     values = fit.values[: homing.common].copy()
     values[homing.bias] = np.where(_named(homing, found), values[homing.bias], model.fit.values[homing.bias])
     set_up = homed(set_up, further)
@@ -268,9 +268,10 @@ def _free(homing: Homing, found: Found, kept: Sequence[int]) -> np.ndarray:
 
 
 def _offsets(homing: Homing, values: np.ndarray, found: Found) -> np.ndarray:
-    """What the encoders show in each run beyond what the model says in any case, rad or m, (R, J)."""
-    own = values[homing.own]
-    return np.where(_named(homing, found), own - own.mean(axis=0), own + values[homing.bias])
+    """What encoders show in each run beyond what the model says in any case, rad or m, (R, J); 0 where no window is."""
+    own, there = values[homing.own], np.isin(np.arange(len(homing.own)), homing.run)
+    more = np.where(_named(homing, found), own - own[there].mean(axis=0), own + values[homing.bias])
+    return np.where(there[:, None], more, 0.0)
 
 
 def _named(homing: Homing, found: Found) -> np.ndarray:
@@ -292,7 +293,7 @@ def _homing(set_up: SetUp, found: Found, joints: Sequence[str], say: Progress) -
     if selector.select is not None:
         episodes += [set_up.select.episodes[i] for i in selector.select.windows.episode]
     run = np.array([runs.index(episode.run) for episode in episodes])
-    return Homing(selector.every_window(), run, _biases(selector.simulation, joints))
+    return Homing(selector.every_window(), run, len(runs), _biases(selector.simulation, joints))
 
 
 def _biases(simulation: Simulation, joints: Sequence[str]) -> np.ndarray:

@@ -16,6 +16,7 @@ from sb3_rpto.tracing.html import render
 
 #: of six runs, in rad
 ZEROS = np.array([0.03, -0.02, 0.0, -0.04, 0.05, -0.01])
+SAMPLED = ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")
 KINDS = ["spring", "sensor_bias"]
 
 
@@ -102,6 +103,14 @@ def test_a_corrected_model_tells_the_zeros_of_other_runs() -> None:
     np.testing.assert_allclose(zeros.offsets, [[0.07], [-0.05]], atol=2e-3)
     with pytest.raises(ValueError, match="no encoder's zero"):
         traced(0.0, 0.0, 0.05).zeros_of(new)
+
+
+def test_of_a_run_that_is_too_short_for_a_window_no_zero_is_said() -> None:
+    data = shifted(runs(), ZEROS)
+    short = replace(data.episodes[-1], **{k: getattr(data.episodes[-1], k)[:40] for k in SAMPLED})
+    report = briefly(PENDULUM, replace(data, episodes=[*data.episodes[:-1], short]), [], KINDS)
+    assert short.run in {*report.runs["train"], *report.runs["select"]} - {*report.zeros.runs}
+    np.testing.assert_allclose(differences(report, 1.0), 0.0, atol=1e-3)
 
 
 def test_without_a_bias_among_the_candidates_none_are_looked_for() -> None:
