@@ -258,7 +258,9 @@ def _differing(homing: Homing, found: Found) -> tuple[list[int], Evidence, np.nd
             break
         worst = min(weak, key=lambda j: evidence[j].t)
         kept, (fit, errors) = [k for k in kept if k != worst], trials[worst]
-    return kept, compare(without, errors, blocks), fit.values
+    together = compare(without, errors, blocks)
+    # So many numbers fit a little of whatever lacks: far from the noise, too, all of t* is asked of them together.
+    return kept if together.t > found.on.fine.threshold else [], together, fit.values
 
 
 def _free(homing: Homing, found: Found, kept: Sequence[int]) -> np.ndarray:
