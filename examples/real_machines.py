@@ -23,7 +23,6 @@ import numpy as np
 from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.machines import MACHINES, Machine, find_measured
 from sb3_rpto.tracing import Measurements, Report, trace
-from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, predictions
 from sb3_rpto.tracing.windows import cut
 
@@ -31,8 +30,6 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 RESULTS = Path("examples/results/machines")
-#: Arrays of an episode that have an item for each sample.
-SAMPLED = ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")
 
 
 def rows(name: str, data: str, model: str, errors: list[HorizonError]) -> list[dict[str, object]]:
@@ -74,13 +71,9 @@ def study(machine: Machine, out: Path, seed: int) -> tuple[list[dict[str, object
 
 def halves(data: Measurements) -> tuple[Measurements, Measurements]:
     """The first and the second half of each run."""
-    parts: tuple[list[Episode], list[Episode]] = ([], [])
-    for e in data.episodes:
-        middle = len(e) // 2
-        for part, samples, later in zip(parts, (slice(middle), slice(middle, None)), (e.after_gap, True)):
-            arrays = {k: getattr(e, k)[samples] for k in SAMPLED}
-            part.append(replace(e, after_gap=later, **arrays))
-    return replace(data, episodes=parts[0]), replace(data, episodes=parts[1])
+    first = [e.part_of(slice(len(e) // 2), e.after_gap) for e in data.episodes]
+    second = [e.part_of(slice(len(e) // 2, None), True) for e in data.episodes]
+    return replace(data, episodes=first), replace(data, episodes=second)
 
 
 def homed(machine: Machine, report: Report, seed: int) -> list[dict[str, object]]:

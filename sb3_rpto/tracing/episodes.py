@@ -74,6 +74,16 @@ class Episode:
     def __len__(self) -> int:
         return len(self.time)
 
+    def part_of(self, samples: slice, after_gap: bool) -> "Episode":
+        """A part of it by itself; copies.
+
+        :param samples: which
+        :param after_gap: as above
+        """
+        names = ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")
+        arrays = {name: getattr(self, name)[samples].copy() for name in names}
+        return replace(self, after_gap=after_gap, **arrays)
+
 
 def _is_number(value: object) -> bool:
     try:
@@ -210,11 +220,7 @@ def repair(run: Episode, columns: Columns, findings: list[Finding]) -> list[Epis
             message = f"{rows.stop - rows.start} row(s) between gaps are too few to use; set aside"
             findings.append(Finding("short", name, message))
             continue
-        arrays = {
-            k: getattr(run, k)[rows].copy()
-            for k in ("time", "qpos", "qvel", "ctrl", "qfrc", "enabled", "usable", "placed")
-        }
-        pieces.append(replace(run, name=name, after_gap=i > 0, **arrays))
+        pieces.append(replace(run.part_of(rows, after_gap=i > 0), name=name))
         _channels(pieces[-1], columns, findings)
     return pieces
 

@@ -167,7 +167,7 @@ class Problem:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residuals and their derivatives by the free parameters (in plausible sizes) and by the start.
 
-        :param values: (p,), or (W, p) for parameters of its own in each window
+        :param values: (p,), or (W, p) for parameters of its own in each window (then none may be free)
         :param starts: (W, 2 nv)
         :param free: (f,) indices
         :param base: the residuals, (W, R), where they are known from before
@@ -179,7 +179,7 @@ class Problem:
         columns, p = f + x + (base is None), values.shape[-1]
         all_values = np.tile(np.broadcast_to(values, (count, p)), (columns, 1, 1))
         all_starts = np.tile(starts, (columns, 1, 1))
-        step = self.steps(values if values.ndim == 1 else values.mean(axis=0))[free] if f else np.empty(0)
+        step = self.steps(values)[free] if f else np.empty(0)
         for i, parameter in enumerate(free):
             all_values[i, :, parameter] += step[i]
         for i, coordinate in enumerate(self.moving):

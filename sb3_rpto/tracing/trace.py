@@ -41,7 +41,7 @@ from sb3_rpto.tracing.residuals import learnable_share, summary
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.search import Found, find, worth_a_look
 from sb3_rpto.tracing.select import Selection, Selector
-from sb3_rpto.tracing.zeros import as_fitted, homed, settled, zeros_by_run
+from sb3_rpto.tracing.zeros import homed, settled, zeros_by_run
 
 #: Verdicts that leave nothing to look for.
 SETTLED = ("complete", "explained")
@@ -109,14 +109,14 @@ def trace(
         set_up = prepared(True)
         found = search(set_up)
         set_up.findings.append(again)
-    first, zeros = found, None
-    settled_so = judge(found.before, found.after, bool(found.selection.model.effects)) in SETTLED
-    if not (settled_so and as_fitted(found, seed).adequate):  # few select runs may have zeros like each other's
-        say(0.8, "looking for encoder zeros that differ by run")
-        zeros = zeros_by_run(set_up, found, say)
+    first, explained = found, judge(found.before, found.after, bool(found.selection.model.effects)) in SETTLED
+    zeros = zeros_by_run(set_up, found, explained, say, seed)
     if zeros is not None:
-        set_up = homed(set_up, zeros)
-        set_up, zeros, found = settled(set_up, zeros, search(set_up), say, seed)
+        without = homed(set_up, zeros)
+        without, refined, then = settled(without, zeros, search(without), say, seed)
+        zeros = refined if then.after.adequate or then.after.ratio < found.after.ratio else None
+    if zeros is not None:
+        set_up, found = without, then
         set_up.findings.append(zeros.finding())
     named = bool(found.selection.model.effects) or zeros is not None
     no_better = not found.after.ratio < first.before.ratio

@@ -12,15 +12,14 @@ from scipy.stats import t as student
 from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.effects.sensors import readers
 from sb3_rpto.tracing import wording
-from sb3_rpto.tracing.adequacy import Adequacy, adequacy
+from sb3_rpto.tracing.adequacy import adequacy
 from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds
+from sb3_rpto.tracing.evidence import Evidence, compare, folds
 from sb3_rpto.tracing.identify import Fit, Problem
-from sb3_rpto.tracing.loss import FAR
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.prepare import SELECT, TRAIN, Progress, SetUp
 from sb3_rpto.tracing.search import Found, judged
-from sb3_rpto.tracing.select import LIKELY, TENTH
+from sb3_rpto.tracing.select import Model
 from sb3_rpto.tracing.unseen import unseen_errors
 from sb3_rpto.tracing.windows import cut
 
@@ -132,21 +131,18 @@ class Homing(Problem):
         return r, jt, jx
 
 
-def as_fitted(found: Found, seed: int) -> Adequacy:
-    """The adequacy of a model on the windows that it was fitted to."""
-    train = found.on.fine.train
-    return adequacy(train, train.score(found.selection.model.fit.values), seed)
-
-
-def zeros_by_run(set_up: SetUp, found: Found, say: Progress) -> Zeros | None:
+def zeros_by_run(set_up: SetUp, found: Found, explained: bool, say: Progress, seed: int) -> Zeros | None:
     """The encoders whose zeros clearly differ from run to run, beside what a search has found; None where none do.
 
     Looked for where a bias of the sensor is, and in runs of a machine: a simulator has one zero. Not where a servo
-    regulates what the encoder shows, and not in runs that are so many and short that few have two windows.
+    regulates what the encoder shows, and not in runs that are so many and short that few have two windows; nor where
+    the model accounts for all runs.
 
     :param set_up: recordings
     :param found: by the search on them
+    :param explained: whether that accounts for the runs that it was judged on
     :param say: progress
+    :param seed: of the resampling
     """
     data, simulation = set_up.fitted, found.on.fine.simulation
     seen = set(found.on.fine.train.windows.columns.tolist())
@@ -157,6 +153,9 @@ def zeros_by_run(set_up: SetUp, found: Found, say: Progress) -> Zeros | None:
     ]
     if data.exact or data.simulated or len(_runs(set_up)) < 2 or not joints:
         return None
+    if explained and _accounts_for_fitted(found, seed):  # few select runs may have zeros like each other's
+        return None
+    say(0.8, "looking for encoder zeros that differ by run")
     homing = _homing(set_up, found, joints, say)
     if np.median(np.bincount(homing.run)) < LEAST:
         return None
@@ -231,6 +230,14 @@ def settled(set_up: SetUp, zeros: Zeros, found: Found, say: Progress, seed: int)
     return set_up, replace(zeros, offsets=zeros.offsets + further.offsets), found
 
 
+def _accounts_for_fitted(found: Found, seed: int) -> bool:
+    """Whether a model that accounts for the windows that it was judged on does so for those that it was fitted to."""
+    if found.on.fine.select is None:
+        return True  # they are the same
+    train = found.on.fine.train
+    return adequacy(train, train.score(found.selection.model.fit.values), seed).adequate
+
+
 def _differing(homing: Homing, found: Found) -> tuple[list[int], Evidence, np.ndarray]:
     """The joints whose encoders clearly have another zero in each run, by elimination.
 
@@ -252,7 +259,7 @@ def _differing(homing: Homing, found: Found) -> tuple[list[int], Evidence, np.nd
     while kept:
         trials = {j: fitted([k for k in kept if k != j], fit) for j in kept}
         evidence = {j: compare(trial[1], errors, blocks) for j, trial in trials.items()}
-        limit = (LIKELY, TENTH) if np.median(errors) > FAR else (found.on.fine.threshold, GAIN)
+        limit = found.on.fine.limit(Model((), fit, errors))
         weak = [j for j in kept if not evidence[j].clear(*limit)]
         if not weak:
             break

@@ -318,6 +318,18 @@ def only(made):
 RIGHT = ("coulomb_friction(hinge)", (), {"level": 0.11})
 
 
+def test_zeros_are_told_from_each_other_within_a_quarter_of_their_spread():
+    truth, found = {"hinge": [0.03, -0.01, 0.02, -0.04]}, {"0": 0.05, "1": 0.012, "3": -0.021}
+
+    def zeros(offsets):
+        told = None if offsets is None else {"offsets": {"hinge": offsets}, "gain": 0.5, "t": 5.0}
+        return only(result("run_zeros-pendulum-1mrad", planted={}, zeros=told, true_zeros=truth)).measures["zeros"]
+
+    assert zeros(found)  # 20 mrad more in all of them
+    assert not zeros(found | {"3": -0.005})
+    assert not zeros(None)
+
+
 def test_right_answer():
     row = only(result(named=[RIGHT]))
     assert row.passed

@@ -53,7 +53,7 @@ PAIRS = (
     ("command_delay", "asymmetric_damping"),
     ("command_gain", "position_friction"),
 )
-_EVERY = {"complete": 12, "single": 14, "pair": 10, "outside": 8, "not excited": 6, "own classes": 8, "run zeros": 7}
+_EVERY = {"complete": 12, "single": 14, "pair": 10, "outside": 8, "not excited": 6, "own classes": 8, "run zeros": 8}
 _SEED = 50_000  # of sets that the tracer was not developed on
 
 
