@@ -23,6 +23,7 @@ from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.contacts import OFTEN, contact_changes
 from sb3_rpto.tracing.report import Traced
 from sb3_rpto.tracing.trace import SETTLED
+from sb3_rpto.tracing.zeros import Zeros
 
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.bookkeeping import TwoWorlds
@@ -78,6 +79,8 @@ class LoopCloser:
         self.keeps_phi = False
         #: whether the simulator accounts for the target by the last trace, so that it may judge policies
         self.accounts = False
+        #: encoder zeros that differ by run in the robot's log that was traced; None where none do
+        self.zeros: Zeros | None = None
         #: whether a robot's log was traced that holds no transition of the task
         self.log_is_empty = False
         #: of the policy in the simulator as it is fitted
@@ -147,17 +150,23 @@ class LoopCloser:
         """Trace on a robot's log itself, by multiple shooting: one-step errors of noisy samples tell next to nothing.
 
         phi takes all that is found, as long as the simulator with it is stable, and where the verdict is
-        ``unexplained`` errs less on the log; D_target is read anew, as the corrected environment shows it. What the
-        uncorrected source produced is :attr:`stale` from then on.
+        ``unexplained`` errs less on the log; D_target is read anew, as the corrected environment shows it, and without
+        encoder zeros that differ by run. What the uncorrected source produced is :attr:`stale` from then on.
         """
         data = model.transitions("target")
         before = dynamics.error(data)
         report = self._trace(model, dynamics, measured, None)
         added = self._take(model, dynamics, report, data, math.inf)
-        warm.fill_recorded(model, measured, dynamics.effects())
+        self.zeros = report.zeros
+        self.fill_target(model, dynamics, measured)
         self.log_is_empty = model.replay_buffer.target.size() == 0
         self.stale = model.replay_buffer.source.size() > 0 or not model._warm
         _say(model, report, added, f"{len(measured.episodes)} recorded episodes", before, dynamics.error(data))
+
+    def fill_target(self, model: Looping, dynamics: PhysicalDynamics, measured: Measurements) -> None:
+        """Let D_target hold a log that was traced, as the corrected machine would have shown it."""
+        homed = measured if self.zeros is None else self.zeros.taken_off(measured)
+        warm.fill_recorded(model, homed, dynamics.effects())
 
     def begin(self, model: Looping) -> None:
         """Before the rounds of ``learn()``: what the last one left undone."""
@@ -316,7 +325,7 @@ def trace_log(model: Looping) -> None:
             "Measurements.from_csv(...) again"
         )
     if loop.found:
-        warm.fill_recorded(model, model.measured, dynamics.effects())
+        loop.fill_target(model, dynamics, model.measured)
     else:
         loop.close_on_log(model, dynamics, model.measured)
 

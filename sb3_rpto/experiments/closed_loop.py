@@ -22,6 +22,7 @@ from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.effects import LIBRARY, Declared, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments import sources
+from sb3_rpto.experiments.provenance import commit
 from sb3_rpto.experiments.report import iqm_interval
 from sb3_rpto.experiments.run import transfer
 from sb3_rpto.tracing.report import write_atomically
@@ -207,6 +208,7 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
     if path.exists():
         return path
     th.set_num_threads(1)
+    made_by = commit()  # a checkout may move on while this runs
     method, points, settings = METHODS[job.method]
     points = tuple(p for p in points if budget is None or p <= budget) or ((budget,) if points and budget else ())
     agent, data = source_agent(job.task, folder)
@@ -232,7 +234,7 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
         read=partial(_read, job.task, truth),
         **kwargs,
     )
-    write_atomically(path, json.dumps([{**row, **asdict(job)} for row in rows], indent=1) + "\n")
+    write_atomically(path, json.dumps([{**row, **asdict(job), "commit": made_by} for row in rows], indent=1) + "\n")
     return path
 
 

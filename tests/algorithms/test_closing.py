@@ -30,6 +30,7 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.tracing.zeros import Zeros
 
 TASK = "InvertedDoublePendulum-v5"
 KINDS = ["coulomb_friction", "torque_offset", "quadratic_drag"]
@@ -444,11 +445,12 @@ def test_a_new_target_is_traced_anew(soon: None) -> None:
     assert made.loop.due(made, dynamics(made))
 
 
-def explanation(effects: list[Effect], verdict: str = "explained") -> SimpleNamespace:
+def explanation(effects: list[Effect], verdict: str = "explained", zeros: Zeros | None = None) -> SimpleNamespace:
     """What a trace would report."""
     traced = tuple(SimpleNamespace(effect=e, label=e.label, interval=np.stack([e.values, e.values])) for e in effects)
     ratio = SimpleNamespace(ratio=1.0)
-    return SimpleNamespace(verdict=verdict, adequacy_before=ratio, adequacy_after=ratio, declared=(), effects=traced)
+    said = {"verdict": verdict, "declared": (), "effects": traced, "zeros": zeros}
+    return SimpleNamespace(adequacy_before=ratio, adequacy_after=ratio, **said)
 
 
 def test_a_later_explanation_takes_the_place_of_an_earlier_one() -> None:
@@ -511,6 +513,25 @@ def test_learning_in_the_corrected_simulator_that_was_interrupted_is_counted_and
     made.learn(1, reset_num_timesteps=False)
     assert not made.loop.stale
     assert made.source_timesteps >= before + 25 + 25
+
+
+def test_encoder_zeros_that_differ_by_run_are_taken_off_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
+    runs = tuple(dict.fromkeys(episode.run for episode in measured.episodes))
+
+    def positions(zeros: Zeros | None) -> tuple[RPTO, np.ndarray]:
+        made = model([], target_data=measured)
+        said = explanation([], zeros=zeros)
+        monkeypatch.setattr(made.loop, "_trace", lambda *_: made.loop.found.append({"verdict": "explained"}) or said)  # type: ignore[union-attr,func-returns-value]
+        made.learn(4, source_timesteps=0)
+        return made, made.transitions("target").observations[:, 0].numpy()
+
+    plain = positions(None)[1]
+    made, homed = positions(Zeros(("slider",), runs, np.full((len(runs), 1), 0.3), 0.5, 9.0))
+    np.testing.assert_allclose(plain - homed, 0.3, atol=1e-6)
+    made.replay_buffer.target.reset()  # a checkpoint that is loaded without its buffers
+    made.learn(4, reset_num_timesteps=False)
+    np.testing.assert_array_equal(made.transitions("target").observations[:, 0], homed)
 
 
 def test_a_budget_of_source_steps_is_not_exceeded_by_the_loop(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:

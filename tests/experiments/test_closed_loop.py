@@ -120,6 +120,15 @@ def test_noisy_sensors_are_those_of_the_target_and_the_loop_is_told(
     assert "double-pendulum_none_0_SAC-warm_0_sensors-0.001.json" in names
 
 
+def test_a_run_says_which_commit_made_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study, "source_agent", lambda *_: ("agent", None))
+    monkeypatch.setattr(study, "commit", lambda: "0123abc")
+    monkeypatch.setattr(study, "transfer", lambda *_, **__: [{"method": "zero-shot", "return": 1.0}])
+    study.run(study.Job("double-pendulum", "none", 1, "zero-shot", 0), tmp_path)
+    (row,) = study.collected(tmp_path).to_dict("records")
+    assert (row["commit"], row["return"], row["target"]) == ("0123abc", 1.0, 1)
+
+
 def test_finished_runs_are_not_repeated_and_are_collected(tmp_path: Path) -> None:
     job = study.Job("double-pendulum", "none", 0, "zero-shot", 0)
     path = tmp_path / f"{job.name}.json"
