@@ -98,6 +98,8 @@ def draw(summary: pd.DataFrame, oracles: dict[tuple[str, str, int], float], path
     lines = summary.rename(columns={"shift": "target", "method": "label", "iqm": "return"})
     lines = lines.rename(columns={"low": "return_low", "high": "return_high"})
     lines = lines[lines["label"] != "zero-shot"]
+    every = lines.groupby(["task", "target", "label"])["runs"].transform("max")
+    lines = lines[lines["runs"] == every]  # a curve is of the same runs from end to end
     best = pd.Series(oracles, dtype=float)
     places = best.groupby(level=[0, 1]).mean().items() if len(best) else ()
     references = {f"{task}_{shift}": {"oracle": value} for (task, shift), value in places}
@@ -106,6 +108,7 @@ def draw(summary: pd.DataFrame, oracles: dict[tuple[str, str, int], float], path
     for axis in figure.axes:
         axis.set_xscale("symlog", linthresh=250)
         axis.set_xlim(left=0)
+        axis.ticklabel_format(axis="y", useOffset=False)
     figure.savefig(path, dpi=120)
 
 

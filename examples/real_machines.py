@@ -23,7 +23,7 @@ import numpy as np
 from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.machines import MACHINES, Machine, find_measured
 from sb3_rpto.tracing import Measurements, Report, trace
-from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, predictions
+from sb3_rpto.tracing.evaluate import MOST, HorizonError, horizon_errors, predictions
 from sb3_rpto.tracing.windows import cut
 
 matplotlib.use("Agg")
@@ -63,6 +63,7 @@ def study(machine: Machine, out: Path, seed: int) -> tuple[list[dict[str, object
             errors = horizon_errors(report.simulation, values, machine.other, report.sigma, seed)
             found += rows(machine.name, "other", label, errors)
     found += homed(machine, report, seed)
+    found += side_by_side(machine, report)
     draw(machine, report)
     keys = ("verdict", "declared", "effects", "zeros", "adequacy_before", "adequacy_after")
     kept = {key: report.to_json()[key] for key in keys}
@@ -91,6 +92,28 @@ def homed(machine: Machine, report: Report, seed: int) -> list[dict[str, object]
         for label, values, runs in models:
             errors = horizon_errors(report.simulation, values, runs, report.sigma, seed)
             found += rows(machine.name, f"{what}, second half", label, errors)
+    return found
+
+
+def side_by_side(machine: Machine, report: Report, horizon: float = 0.5, phases: int = 10) -> list[dict[str, object]]:
+    """Errors of predictions that lie side by side, by where the first of a run begins: what that choice decides."""
+    found: list[dict[str, object]] = []
+    for what, data in (("test", report.data), ("other", machine.other)):
+        if data is None:
+            continue
+        joints = tuple(c for c in data.columns.qpos if c not in data.unobserved)
+        for start in np.arange(phases) * horizon / phases:
+            parts = [
+                e.part_of(slice(int(np.searchsorted(e.time, e.time[0] + start - 1e-9)), None), e.after_gap)
+                for e in data.episodes
+            ]
+            windows = cut(report.simulation.model, replace(data, episodes=parts), report.sigma, horizon, MOST)
+            for label, values in (("declared", report.values_before), ("corrected", report.values_after)):
+                _, difference, usable = predictions(report.simulation, values, windows)
+                error = np.abs(difference[usable])
+                rmse, none = np.sqrt((error**2).mean(axis=0)), np.full(len(joints), np.nan)
+                pooled = HorizonError(horizon, joints, rmse, none, none, error.mean(axis=0), len(windows))
+                found += rows(machine.name, f"{what}, side by side from {start:.2f} s", label, [pooled])
     return found
 
 
