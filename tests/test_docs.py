@@ -18,7 +18,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto import RPTO
-from sb3_rpto.algorithms import closing, relabel
+from sb3_rpto.algorithms import closing, renewal
 from sb3_rpto.callbacks import RelativityGapCallback
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
 from sb3_rpto.effects import LIBRARY, Parameter, declare, parameter_names
@@ -116,7 +116,7 @@ def test_every_logged_key_is_explained_and_every_explained_key_is_logged(tmp_pat
     model = RPTO("MlpPolicy", cartpole, target_env=gym.make(cartpole, pole_length=2.0), gradient_steps=1, **physical)
     keys |= logged(model)
     monkeypatch.setattr(closing, "FIRST", 80)
-    monkeypatch.setattr(relabel, "FILL", 25)
+    monkeypatch.setattr(renewal, "FILL", 25)
     double = "InvertedDoublePendulum-v5"
     target = apply_effects(gym.make(double), [LIBRARY["coulomb_friction"]("slider", level=5.0)])
     settings = {

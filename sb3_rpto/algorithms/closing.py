@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,11 +12,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.rehearsals import Rehearsals
-from sb3_rpto.algorithms.relabel import outdated, renew_source
+from sb3_rpto.algorithms.renewal import outdated, renew_source
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
-from sb3_rpto.effects import Declared, Effect, from_json
+from sb3_rpto.effects import Declared, from_json
 from sb3_rpto.envs.observations import single_env
 from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Measurements, Report, trace
@@ -73,8 +73,6 @@ class LoopCloser:
         self._error = math.inf
         #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
         self.stale = False
-        #: effects of the simulator that made D_source
-        self.made_by: list[Effect] = []
         #: whether phi is what a trace of noisy transitions made it
         self.keeps_phi = False
         #: whether the simulator accounts for the target by the last trace, so that it may judge policies
@@ -188,11 +186,9 @@ class LoopCloser:
         """
         if self.stale:
             model.snapshots.pop("learner", None)  # of the simulator that is dropped
-            assert isinstance(model.dynamics, PhysicalDynamics)  # what was traced
-            renew_source(model, model.dynamics, self.made_by)
-            self.made_by = model.dynamics.effects()
+            renew_source(model)
             if model.updates_policy and not model._offline and model.updates_per_step:
-                learn_in_source(model, lambda: self.rehearse(model))
+                learn_in_source(model, self)
                 if self.may_judge(model):
                     self.rehearsals.go_back(model)
             self.stale = False
@@ -411,12 +407,14 @@ def learn_for_a_step(model: Looping) -> int:
     return taken
 
 
-def learn_in_source(model: Looping, rehearse: Callable[[], None]) -> None:
-    """Learn in the present simulator by rounds while its episodes earn more; the target waits meanwhile.
+def learn_in_source(model: Looping, loop: LoopCloser) -> None:
+    """Learn in the present simulator by rounds while that earns more; the target waits meanwhile.
 
-    :param rehearse: called before the first round and after each
+    What counts is what the best policy so far earns in rehearsals, which are as frequent as beside target steps: from one
+    to the next a policy may lose most of what it earns, and win it back. Where the simulator may not judge, it is what
+    the round's own episodes earned.
     """
-    rehearse()
+    loop.rehearse(model)
     source = model._source_world
     assert isinstance(source, EpisodeSource)
     bar, idle, steps = -math.inf, 0, 0
@@ -425,10 +423,15 @@ def learn_in_source(model: Looping, rehearse: Callable[[], None]) -> None:
         end = min(steps + ROUND, model.retrain_steps)
         while steps < end:
             steps += learn_for_a_step(model)
+            if loop.rehearsals.due(model._n_updates):
+                loop.rehearse(model)
         # Where no episode ended there is nothing to judge by, and learning goes on.
         earned = float(np.mean(source.returns)) if source.returns else math.inf
+        if loop.may_judge(model):
+            earned = loop.rehearsals.best
         if model.verbose:
-            print(f"learning in the corrected simulator: {steps} source steps, mean return {earned:.5g}")
-        rehearse()
+            print(f"learning in the corrected simulator: {steps} source steps, return {earned:.5g}")
         idle = 0 if earned > bar else idle + 1
         bar = earned + RISE * abs(earned) if bar < earned < math.inf else bar
+    if loop.rehearsals.is_behind(model):
+        loop.rehearse(model)

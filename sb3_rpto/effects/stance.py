@@ -90,21 +90,6 @@ def nominal_heights(model: mujoco.MjModel) -> tuple[float, float] | None:
     return None if joint is None else _heights(model, joint, model.qpos0)
 
 
-def lifted(qpos: np.ndarray, before: mujoco.MjModel, after: mujoco.MjModel) -> np.ndarray:
-    """A pose of a walker whose body has changed, so high that its lowest point is as far from the floor as before.
-
-    :param qpos: pose of ``before``, (nq,)
-    :return: pose of ``after``, (nq,); the same for tasks without a vertical coordinate or a floor
-    """
-    joint = _vertical(before)
-    found = [None if joint is None else _heights(m, joint, qpos) for m in (before, after)]
-    if joint is None or found[0] is None or found[1] is None:
-        return qpos
-    raised = qpos.copy()
-    raised[_address(after, joint)] += found[0][0] - found[1][0]
-    return raised
-
-
 def _vertical(model: mujoco.MjModel) -> int | None:
     """The joint that holds the height of a body in the world: a free joint, or a slide along z; None without."""
     for joint in range(model.njnt):

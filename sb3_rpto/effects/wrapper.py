@@ -15,7 +15,7 @@ from gymnasium.utils import EzPickle, RecordConstructorArgs
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.sensors import ago
-from sb3_rpto.effects.simulation import Active, memory, prepare, push, pushing
+from sb3_rpto.effects.simulation import Active, prepare, push, pushing
 from sb3_rpto.effects.world import LiveWorld
 
 # Where gymnasium's MujocoEnv steps its physics, and what an environment without that method may offer instead.
@@ -135,11 +135,6 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
     def alters_observations(self) -> bool:
         """Whether sensors, of these effects or of those beneath, show something else than the state."""
         return any(layer._sensing for layer in corrections(self))
-
-    @property
-    def remembers(self) -> bool:
-        """Whether the last step depended on commands from before it, by these effects, those beneath, or the model."""
-        return memory(self.unwrapped.model) > 0 or any(any(layer._memory) for layer in corrections(self))  # type: ignore[attr-defined]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; commands from before it are forgotten."""

@@ -21,10 +21,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPTO, RTO
-from sb3_rpto.algorithms import arguments, closing, relabel
+from sb3_rpto.algorithms import arguments, closing, renewal
 from sb3_rpto.algorithms.closing import LoopCloser, stays_finite
 from sb3_rpto.algorithms.rehearsals import Rehearsals
-from sb3_rpto.algorithms.relabel import outdated, renew_source
+from sb3_rpto.algorithms.renewal import outdated, renew_source
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
@@ -60,14 +60,14 @@ def model(lacks: list[Effect], cls: type = RPTO, **kwargs: object) -> RPTO:
 @pytest.fixture
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closing, "FIRST", 80)
-    monkeypatch.setattr(relabel, "FILL", 25)
+    monkeypatch.setattr(renewal, "FILL", 25)
 
 
 @cache
 def learned() -> RPTO:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(closing, "FIRST", 80)
-        patch.setattr(relabel, "FILL", 25)
+        patch.setattr(renewal, "FILL", 25)
         return model(friction()).learn(100, source_timesteps=100)
 
 
@@ -150,7 +150,7 @@ def learned_from_noise() -> RPTO:
     noise = np.array([3e-4] * 5 + [3e-3] * 3 + [0.0])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(closing, "FIRST", 120)
-        patch.setattr(relabel, "FILL", 25)
+        patch.setattr(renewal, "FILL", 25)
         passed = {"observation_noise": noise.tolist()}
         made = model([], target_env=noisy(noise), dynamics_kwargs=passed, close_loop=["coulomb_friction"])
         return made.learn(170, source_timesteps=180)
@@ -244,12 +244,12 @@ def test_no_target_step_is_spent_on_tracing() -> None:
     assert made.target_spent == {"learning": 100}
 
 
-def test_what_an_uncorrected_source_produced_is_simulated_again() -> None:
+def test_what_an_uncorrected_source_produced_is_dropped() -> None:
     made = learned()
-    # The first are those that are simulated again, more than there are fresh steps since the trace at step 80.
+    assert made.loop is not None
     source = made.transitions("source")
-    assert len(source) > 100 + 25 + 28 + 4 + 4 * 21
-    assert dynamics(made).error(source.take(slice(100))) < relabel.OTHER
+    assert made.source_timesteps - made.loop.rehearsals.steps - len(source) >= 100 + 80  # all from before the trace
+    assert dynamics(made).error(source) < renewal.OTHER
 
 
 def test_source_episodes_have_the_effect() -> None:
@@ -350,7 +350,7 @@ def test_renewed_data_are_the_simulators_own_where_commands_are_late() -> None:
     late = LIBRARY["command_delay"]("slide", delay=0.05).to_json()
     made = model([], dynamics_kwargs={"effects": [late]})
     made.learn(1, source_timesteps=63)
-    renew_source(made, dynamics(made))
+    renew_source(made)
     assert not outdated(made, dynamics(made))
 
 
@@ -361,7 +361,7 @@ def test_data_that_have_lost_their_past_are_not_another_simulators() -> None:
     assert made._source_world is not None
     made._source_world.interact(made, 303)
     assert made.replay_buffer.source.full
-    assert dynamics(made).error(made.transitions("source")) > relabel.OTHER  # the oldest commands are gone
+    assert dynamics(made).error(made.transitions("source")) > renewal.OTHER  # the oldest commands are gone
     assert not outdated(made, dynamics(made))
     dynamics(made).adopt([LIBRARY["coulomb_friction"]("slider", level=50.0)])
     assert outdated(made, dynamics(made))
@@ -509,7 +509,7 @@ def test_learning_in_the_corrected_simulator_that_was_interrupted_is_counted_and
     assert made.loop.stale
     before = made.source_timesteps
     monkeypatch.undo()
-    monkeypatch.setattr(relabel, "FILL", 25)
+    monkeypatch.setattr(renewal, "FILL", 25)
     made.learn(1, reset_num_timesteps=False)
     assert not made.loop.stale
     assert made.source_timesteps >= before + 25 + 25
@@ -620,26 +620,55 @@ class Scripted(EpisodeSource):
         return n_steps
 
 
+class Judge:
+    """Stands for a loop whose simulator judges: each rehearsal earns the next of ``earns``."""
+
+    def __init__(self, earns: list[float], judges: bool) -> None:
+        self.earns, self.judges, self.rehearsals = earns, judges, self
+        self.best, self.asked = -np.inf, 0
+
+    def may_judge(self, model: Any) -> bool:
+        return self.judges
+
+    def due(self, updates: int) -> bool:
+        return True
+
+    def is_behind(self, model: Any) -> bool:
+        return True
+
+    def rehearse(self, model: Any) -> None:
+        self.best = max([self.best, *self.earns[: self.asked]])
+        self.asked += 1
+
+
+GAINS = [
+    ([3.0, 2.0, 1.0, 9.0], 3),  # two rounds in a row without a gain
+    ([1.0, 2.0, 1.5, 2.5, 2.0, 2.5, 9.0], 6),  # one of them alone does not end it, and as much is no gain
+    ([-9.0, -8.0, -7.0, -6.0, -5.0, -4.0, -3.0, -2.0], 8),  # to the last step
+    ([900.0, 900.2, 900.4, 999.0], 3),  # a trifle is no gain
+    ([-900.0, -899.8, -899.6, 0.0], 3),
+    ([900.0, 900.8, 901.6, 902.4, 903.2, 904.0, 904.8, 905.6], 8),  # but trifles add up
+]
+
+
 @pytest.mark.parametrize(
-    ("earns", "rounds"),
+    ("earns", "rounds", "judges"),
     [
-        ([3.0, 2.0, 1.0, 9.0], 3),  # two rounds in a row without a gain
-        ([1.0, 2.0, 1.5, 2.5, 2.0, 2.5, 9.0], 6),  # one of them alone does not end it, and as much is no gain
-        ([-9.0, -8.0, -7.0, -6.0, -5.0, -4.0, -3.0, -2.0], 8),  # to the last step
-        ([], 8),  # nothing to judge by
-        ([900.0, 900.2, 900.4, 999.0], 3),  # a trifle is no gain
-        ([-900.0, -899.8, -899.6, 0.0], 3),
-        ([900.0, 900.8, 901.6, 902.4, 903.2, 904.0, 904.8, 905.6], 8),  # but trifles add up
+        *((*gain, False) for gain in GAINS),
+        *((*gain, True) for gain in GAINS),
+        ([], 8, False),  # nothing to judge by
     ],
 )
 def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
-    earns: list[float], rounds: int, monkeypatch: pytest.MonkeyPatch
+    earns: list[float], rounds: int, judges: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(closing, "ROUND", 20)
     updates: list[int] = []
-    source = Scripted(earns)
+    # What does not count earns ever more.
+    source, judge = Scripted([float(i) for i in range(9)] if judges else earns), Judge(earns, judges)
     made = SimpleNamespace(
         _source_world=source,
+        _n_updates=0,
         updates_per_step=30,
         source_steps=20,
         retrain_steps=160,
@@ -648,10 +677,9 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
         verbose=0,
         train=lambda n, batch_size: updates.append(n),
     )
-    rehearsed: list[None] = []
-    closing.learn_in_source(made, lambda: rehearsed.append(None))  # type: ignore[arg-type]
+    closing.learn_in_source(made, judge)  # type: ignore[arg-type]
     assert updates == [30] * rounds
-    assert len(rehearsed) == 1 + rounds
+    assert judge.asked == 1 + rounds + 1
     assert source.asked == [20] * rounds  # in the source each call draws gSDE's noise anew
     assert made.source_timesteps == 5 + 20 * rounds
 
