@@ -410,9 +410,9 @@ def learn_for_a_step(model: Looping) -> int:
 def learn_in_source(model: Looping, loop: LoopCloser) -> None:
     """Learn in the present simulator by rounds while that earns more; the target waits meanwhile.
 
-    What counts is what the best policy so far earns in rehearsals, which are as frequent as beside target steps: from one
-    to the next a policy may lose most of what it earns, and win it back. Where the simulator may not judge, it is what
-    the round's own episodes earned.
+    What counts is what the best policy so far earns in rehearsals, which are as frequent as beside target steps: from
+    one to the next a policy may lose most of what it earns, and win it back. Where the simulator may not judge, it is
+    what the round's own episodes earned.
     """
     loop.rehearse(model)
     source = model._source_world

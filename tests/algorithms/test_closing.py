@@ -696,11 +696,23 @@ def forgetful() -> RPTO:
     return made
 
 
+def plays(earns: Callable[[], float]) -> Callable[..., np.ndarray]:
+    """Rehearsals whose episodes all earn what is told, the further ones of one as much as the first."""
+    now = np.nan
+
+    def play(model: RPTO, dynamics: PhysicalDynamics, starts: range) -> np.ndarray:
+        nonlocal now
+        now = now if starts.start else earns()
+        return np.full(len(starts), now)
+
+    return play
+
+
 def scripted(made: RPTO, monkeypatch: pytest.MonkeyPatch, *earns: float) -> None:
     """Let rehearsals earn what is written."""
     assert made.loop is not None
     found = iter(earns)
-    monkeypatch.setattr(made.loop.rehearsals, "_play", lambda *_: np.full(25, next(found)))
+    monkeypatch.setattr(made.loop.rehearsals, "_play", plays(lambda: next(found)))
     monkeypatch.setattr(made.loop.rehearsals, "due", lambda _: True)
 
 
@@ -772,7 +784,7 @@ class Watch(BaseCallback):
 def judged(monkeypatch: pytest.MonkeyPatch, every: int = 40, earns: Callable[[], float] = lambda: 1.0) -> RPTO:
     """A model whose simulator judges a policy of so many updates, and finds it to earn what is told."""
     monkeypatch.setattr("sb3_rpto.algorithms.rehearsals.EVERY", every)
-    monkeypatch.setattr(Rehearsals, "_play", lambda *_: np.full(25, earns()))
+    monkeypatch.setattr(Rehearsals, "_play", staticmethod(plays(earns)))
     monkeypatch.setattr(LoopCloser, "due", lambda *_: False)
     made = forgetful()
     made._since_fit = 0
@@ -1010,23 +1022,45 @@ def test_a_rehearsal_plays_the_deterministic_policy_in_the_fitted_simulator(monk
         dynamics(made).fit(data, max_steps=30)
     assert made.loop is not None
     rehearsals, before = made.loop.rehearsals, made.source_timesteps
-    monkeypatch.setattr("sb3_rpto.algorithms.rehearsals.EPISODES", 3)
+    monkeypatch.setattr("sb3_rpto.algorithms.rehearsals.EPISODES", 2)
+    monkeypatch.setattr("sb3_rpto.algorithms.rehearsals.MORE", 1)
     rehearsals.rehearse(made, dynamics(made))
-    returns, steps = [], 0
+    returns, lengths = [], []
     env = target([])
     for i in range(3):
         observation, _ = env.reset(seed=30_000 + i)
+        lengths.append(0)
         over = False
         earned = 0.0
         while not over:
             observation, reward, terminated, truncated, _ = env.step(made.predict(observation, deterministic=True)[0])
-            over, earned, steps = terminated or truncated, earned + float(reward), steps + 1
+            over, earned, lengths[i] = terminated or truncated, earned + float(reward), lengths[i] + 1
         returns.append(earned)
-    assert rehearsals.last == pytest.approx(np.mean(returns), rel=1e-3)
-    # That of the source, the same one here, played too.
-    assert made.source_timesteps - before == rehearsals.steps == 2 * steps
+    # That of the source, the same one here, is the best, and has played all; it beats itself in the first ones or not.
+    assert rehearsals.best == pytest.approx(max(np.mean(returns), np.mean(returns[:2])), rel=1e-3)
+    further = np.mean(returns[:2]) > (1 + 1e-3) * np.mean(returns)
+    assert rehearsals.last == pytest.approx(np.mean(returns if further else returns[:2]), rel=1e-3)
+    assert made.source_timesteps - before == rehearsals.steps == sum(lengths) + sum(lengths[: 3 if further else 2])
     assert not rehearsals.due(made._n_updates)
     assert not rehearsals.is_behind(made)
+
+
+@pytest.mark.parametrize(("further", "taken"), [(80.0, False), (90.0, True)])
+def test_a_policy_that_seems_to_be_the_best_plays_more_episodes(
+    further: float, taken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = forgetful()
+    scripted(made, monkeypatch, 90.0, 50.0)
+    made.loop.watch(made)  # type: ignore[union-attr]
+    spoil(made)
+    changed = weights(made)
+    rehearsals = made.loop.rehearsals  # type: ignore[union-attr]
+    monkeypatch.setattr(rehearsals, "_play", lambda _, __, starts: np.where(np.array(starts) < 25, 100.0, further))
+    rehearsals.rehearse(made, dynamics(made))
+    assert rehearsals.last == pytest.approx((100 + 3 * further) / 4)
+    assert rehearsals.best == pytest.approx(rehearsals.last if taken else 90.0)
+    made.rollback("simulator")
+    assert np.array_equal(weights(made), changed) == taken
 
 
 def test_a_reward_that_is_no_number_is_said_in_a_rehearsal_too(monkeypatch: pytest.MonkeyPatch) -> None:
