@@ -959,9 +959,9 @@ def test_a_loss_within_what_episodes_differ_by_is_none(monkeypatch: pytest.Monke
     """Near a return of zero any change is a large share of it."""
     made = forgetful()
     assert made.loop is not None
-    spread = np.random.default_rng(0).normal(0.0, 0.5, 25)
-    played = iter([spread, spread + 0.02, spread, spread - 5.0])
-    monkeypatch.setattr(made.loop.rehearsals, "_play", lambda *_: next(played))
+    spread = np.random.default_rng(0).normal(0.0, 0.5, 100)
+    played = plays(iter([0.0, 0.02, 0.0, -5.0]).__next__)
+    monkeypatch.setattr(made.loop.rehearsals, "_play", lambda _, __, starts: played(_, __, starts) + spread[starts])
     monkeypatch.setattr(made.loop.rehearsals, "due", lambda _: True)
     made.loop.watch(made)
     spoil(made)
