@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
@@ -238,8 +238,8 @@ def check_something_to_fit(
     """
     if isinstance(close_loop, str):
         raise TypeError(f"close_loop must be True or a list of kinds, not a string; write [{close_loop!r}]")
-    if close_loop is None:
-        raise TypeError("close_loop must be True, False or a list of kinds, not None; leave it out")
+    if not isinstance(close_loop, bool | Sequence | Set):
+        raise TypeError(f"close_loop must be True, False or a list of kinds, not {close_loop!r}; leave it out")
     for kind in [] if isinstance(close_loop, bool) else close_loop:
         if kind not in LIBRARY:
             raise ValueError(f"close_loop: no effect {kind!r} is registered; {near(kind, LIBRARY)}")

@@ -71,9 +71,11 @@ class LoopCloser:
         #: transitions of the target that were ever added before the last trace
         self._traced_at: int | None = None
         self._error = math.inf
+        #: whether the last transitions held too few windows to be traced
+        self._untraced = False
         #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
         self.stale = False
-        #: whether phi is what a trace of noisy transitions made it
+        #: whether a trace made phi that knows better than one-step errors: of noisy transitions, or of late sensors
         self.keeps_phi = False
         #: whether the simulator accounts for the target by the last trace, so that it may judge policies
         self.accounts = False
@@ -105,7 +107,7 @@ class LoopCloser:
             return False
         more = buffer.target_added >= MORE * self._traced_at
         blurred = dynamics.observation_noise is not None and self._traced_at < ENOUGH
-        if more and (blurred or not self.found or self.found[-1]["verdict"] not in SETTLED):
+        if more and (blurred or self._untraced or not self.found or self.found[-1]["verdict"] not in SETTLED):
             return True
         error = dynamics.error(model.transitions("target").take(slice(size - new, None)))
         return error > max(RISEN * self._error, ROUNDING)
@@ -131,13 +133,14 @@ class LoopCloser:
             horizon = (window(measured, contact_changes(base.model, measured)) - 1) * float(base.dt)
             report = self._trace(model, dynamics, measured, horizon)
         except ValueError as error:  # of the data: what was passed was looked at before; a run must not end by it
-            self._error = before
+            self._error, self._untraced = before, True
             warnings.warn(
                 f"{len(data)} target transitions were not traced: {error}; a trace is tried again when there are twice "
                 "as many",
                 stacklevel=2,
             )
             return
+        self._untraced = False
         added = self._take(model, dynamics, report, data, before if noise is None else math.inf)
         self._error = dynamics.error(data)
         _say(model, report, added, f"{len(data)} target transitions", before, self._error)
@@ -277,6 +280,9 @@ class LoopCloser:
         all_traced = (*report.declared, *report.effects)
         found = [traced.effect for traced in all_traced]
         new = [effect.label for effect in found if effect.label not in known and not isinstance(effect, Declared)]
+        late = any(effect.overrides("late") for effect in found)
+        if late:  # what was seen before a step began tells nothing of one-step errors
+            before = math.inf
         if before == math.inf and new and not explains_more(report):
             return []
         kept = dynamics.effects(), dynamics.deviations()
@@ -297,7 +303,7 @@ class LoopCloser:
             dynamics.replace(*kept)
             self.accounts &= not new  # what it lacks is known, and it goes on lacking it
             return []
-        self.keeps_phi = dynamics.observation_noise is not None
+        self.keeps_phi = dynamics.observation_noise is not None or late
         assert model.dynamics_config is not None
         model.dynamics_config["effects"] = dynamics.added()  # what a checkpoint rebuilds the model from
         return new

@@ -87,13 +87,14 @@ def transitions(
     twin.reset(seed=0)
     base: Any = twin.unwrapped
     log = _Log(measured, base.model, float(base.dt))
-    # Sensors that err show the states as they were measured: the simulator is put where they truly were.
+    # Sensors that err show the states as they were measured: the simulator is put where they truly were, but for the
+    # joints of late ones, which the copy, as it has no past, shows as they are: where the log saw them.
     simulation = Simulation(env.unwrapped.model, effects, 1) if effects else None  # type: ignore[attr-defined]
     found: dict[str, list[np.ndarray]] = {"observations": [], "next_observations": [], "actions": []}
     for episode in measured.episodes:
         qpos, qvel, commands, whole = log.steps(episode)
         if simulation is not None and len(qpos):
-            simulation.undo_sensors(np.tile(simulation.values(), (len(qpos), 1)), qpos, qvel)
+            simulation.unobserve(np.tile(simulation.values(), (len(qpos), 1)), qpos, qvel)
         seen = np.array([observe(twin, *state) for state in zip(qpos, qvel, commands)])
         if whole.any():
             found["observations"].append(seen[:-1][whole])

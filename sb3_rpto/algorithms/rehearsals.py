@@ -38,6 +38,7 @@ class Rehearsals:
         #: mean returns of the best policy, and of the last one as long as it acts
         self.best = self.last = -np.inf
         self._errors = 0.0, 0.0  # standard errors of both
+        self._first = -np.inf  # mean return of the best one's first episodes
         #: taken so far, of the source's
         self.steps = 0
         self._phi: np.ndarray | None = None
@@ -58,13 +59,13 @@ class Rehearsals:
         if self._has_moved(dynamics) or (normaliser is not None and normaliser.training):
             self._rehearse_best(model, dynamics)
         returns = self._play(model, dynamics, range(EPISODES))
-        if returns.mean() > self.best + GAIN * abs(self.best):
+        if returns.mean() > self._first + GAIN * abs(self._first):  # from the same starts
             returns = np.concatenate([returns, self._play(model, dynamics, range(EPISODES, EPISODES + MORE))])
         self.last, error = _mean(returns)
         self._errors = self._errors[0], error
         model.logger.record("source/rehearsed", self.last)
         if self.last >= self.best:
-            self.best, self._errors = self.last, (error, error)
+            self.best, self._errors, self._first = self.last, (error, error), float(returns[:EPISODES].mean())
             model.take_snapshot("simulator")
         self._at_update = model._n_updates  # not before: an interrupted one is played again
 
@@ -105,8 +106,9 @@ class Rehearsals:
         model.take_snapshot("present")
         try:
             model.rollback("simulator")
-            self.best, error = _mean(self._play(model, dynamics, range(EPISODES + MORE)))
-            self._errors = error, self._errors[1]
+            returns = self._play(model, dynamics, range(EPISODES + MORE))
+            self.best, error = _mean(returns)
+            self._errors, self._first = (error, self._errors[1]), float(returns[:EPISODES].mean())
         finally:
             model.rollback("present")
             del model.snapshots["present"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
-from sb3_rpto.dynamics.onestep import OneStep, Steps, as_steps
+from sb3_rpto.dynamics.onestep import BLOWN, OneStep, Steps, as_steps
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.effect import from_json
 from sb3_rpto.effects.mjcf import PlainModel
@@ -94,10 +94,10 @@ class PhysicalDynamics(Dynamics):
             ("max_steps", max_steps, 1),
             ("randomise", randomise, 0),
         ):
-            if not value >= least:
-                raise ValueError(f"{name} must be at least {least:g}, not {value!r}")
+            if not isinstance(value, Real) or not least <= value < np.inf:
+                raise ValueError(f"{name} must be a finite number of at least {least:g}, not {value!r}")
         for name, value in (("max_steps", max_steps), ("threads", threads)):
-            if not isinstance(value, Integral) or value < 0:
+            if not isinstance(value, Integral) or isinstance(value, bool) or value < 0:
                 raise ValueError(f"{name} must be an integer that is not negative, not {value!r}")
         if isinstance(model, PlainModel):
             model = model.compile()
@@ -119,7 +119,8 @@ class PhysicalDynamics(Dynamics):
         gears = np.abs(self.model.actuator_gear[:, 0]) * np.max(
             np.abs(self.model.actuator_ctrlrange), axis=1, initial=0
         )
-        scales = Scales(torque=float(gears.max(initial=1.0)))
+        strongest = float(gears.max(initial=0.0))
+        scales = Scales(torque=strongest if strongest > 0 else 1.0)
         parameters = [p for e in self.simulation.effects for p in e.parameters]
         self.names = [_name(e, p.name) for e in self.simulation.effects for p in e.parameters]
         self._lower, self._upper = (np.array([getattr(p, b) for p in parameters]) for b in ("lower", "upper"))
@@ -285,7 +286,8 @@ class PhysicalDynamics(Dynamics):
         if not len(steps) or not shown.any():
             return float("nan")
         begun = np.concatenate([steps.qpos, steps.qvel], axis=1)
-        reached = np.nan_to_num(steps.reach(self.simulation, self.values[None])[0])
+        reached = steps.reach(self.simulation, self.values[None])[0]
+        reached = np.where(np.isfinite(reached), reached, begun + BLOWN * np.where(shown, steps.scale, 0.0))
         before, predicted, after = (th.as_tensor(x[:, shown]) for x in (begun, reached, steps.reached))
         return relative_error(predicted, Transitions(before, before, before, after, before))
 

@@ -276,8 +276,13 @@ def register(effect: type[Effect]) -> type[Effect]:
 def from_json(stored: Mapping[str, Any]) -> Effect:
     """The effect that :meth:`Effect.to_json` described.
 
-    :raises ValueError: no effect of that kind is registered
+    :raises ValueError: no effect of that kind is registered, or the description is not whole
     """
+    lacks = {"kind", "on", "values"} - set(stored)
+    if lacks:
+        raise ValueError(
+            f"{dict(stored)!r} describes no effect: it lacks {', '.join(sorted(lacks))}; see Effect.to_json"
+        )
     if stored["kind"] not in LIBRARY:
         raise ValueError(f"no effect {stored['kind']!r} is registered; {near(stored['kind'], LIBRARY)}")
     return LIBRARY[stored["kind"]](stored["on"], **stored["values"])

@@ -56,7 +56,8 @@ def given(model: mujoco.MjModel, declared: Sequence[str], known: Sequence[Effect
 
     :param model: the compiled model
     :param declared: names, as :func:`~sb3_rpto.effects.declare` takes them
-    :param known: effects of the library with the values that are known; declared numbers among them count as declared
+    :param known: effects of the library with the values that are known; declared numbers among them count as declared,
+        and begin where the model has them
     :raises ValueError: a name or an effect that the model does not have, or has twice; a known effect that does nothing
     :raises TypeError: ``known`` holds something else
     """

@@ -1,4 +1,4 @@
-"""What a joint's sensor shows, to whoever records it and to the servo that regulates it."""
+"""What a joint's sensor shows, to whoever records it and, but for a delay, to the servo that regulates it."""
 
 import mujoco
 import numpy as np
@@ -40,7 +40,8 @@ def ago(steps: np.ndarray, q: np.ndarray, v: np.ndarray) -> Pair:
 class SensorDelay(Effect):
     r"""A sensor that is late, by its bus or its filter: it shows :math:`q(t - d)` and :math:`\dot q(t - d)`.
 
-    Before an episode has lasted so long, it shows the first state. Where all sensors are as late as each other, the
+    A position servo regulates what is there now: in MuJoCo it reads no sensor. Before an episode has lasted so long, it
+    shows the first state. Where all sensors are as late as each other, the
     recordings are those of late commands. A constant delay from sensor to controller (Nilsson 1998).
     """
 

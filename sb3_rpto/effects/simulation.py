@@ -121,6 +121,16 @@ class Simulation:
         """The effects on sensors with their parameters, of ``values`` (n, p)."""
         return [(effect, values[:, s]) for effect, s in zip(self.effects, self.slices) if effect.senses]
 
+    def unobserve(self, values: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Take back, in place, what the sensors make of states, but for delays.
+
+        :param values: (n, p)
+        :param qpos: as the sensors show it, (n, nq)
+        :param qvel: likewise, (n, nv)
+        """
+        for effect, x in reversed(self.sensing(values)):
+            qpos[:, effect.adr], qvel[:, effect.dof] = effect.unobserve(qpos[:, effect.adr], qvel[:, effect.dof], x)
+
     def undo_sensors(
         self, values: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, qacc: np.ndarray | None = None
     ) -> None:
@@ -134,10 +144,8 @@ class Simulation:
         :param qvel: likewise, (n, nv)
         :param qacc: how fast the speeds change, (n, nv); None: not at all
         """
-        sensing = self.sensing(values)
-        for effect, x in reversed(sensing):
-            qpos[:, effect.adr], qvel[:, effect.dof] = effect.unobserve(qpos[:, effect.adr], qvel[:, effect.dof], x)
-        for effect, x in sensing:
+        self.unobserve(values, qpos, qvel)
+        for effect, x in self.sensing(values):
             age, a = effect.late(x), 0.0 if qacc is None else qacc[:, effect.dof]
             qpos[:, effect.adr] += age * (qvel[:, effect.dof] + 0.5 * age * a)
             qvel[:, effect.dof] += age * a

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import mujoco
 import numpy as np
 
 from sb3_rpto.effects import Effect
@@ -171,8 +172,9 @@ def _actuator(model: Any, dof: int, given: int | None) -> int:
     """The actuator whose command is shown: the given one, one at the joint, or the first."""
     if given is not None:
         return given
-    at = [a for a in range(model.nactuator) if model.actuator_trnid[a, 0] == model.dof_jntid[dof]]
-    return at[0] if at else 0
+    joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    at = np.flatnonzero(joints & (model.actuator_trnid[:, 0] == model.dof_jntid[dof]))
+    return int(at[0]) if len(at) else 0
 
 
 def _cause(r: ForceResidual, dof: int, cause: str, actuator: int) -> np.ndarray:

@@ -173,7 +173,7 @@ def prepare(
     train, select, test, fitted = (replace(d, touching=touching) for d in (train, select, test, fitted))
     nominal = discretised(compiled, fitted, fine=True)
     there = given(nominal, declared, known)
-    if seems == "machine":
+    if seems == "machine" and not data.exact:
         findings += soft_friction(nominal) + soft_ties(nominal)
     settings = {Declared(nominal, name, (-np.inf, np.inf)).number: name for name in data.columns.params}
     for one in there:

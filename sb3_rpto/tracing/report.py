@@ -82,7 +82,7 @@ class Traced:
         parts = []
         for p, value, unit, (low, high) in zip(self.effect.parameters, self.effect.values, self.units, self.interval.T):
             name = "" if isinstance(self.effect, Declared) else f"{p.name} "
-            parts.append(f"{name}{value:.4g} [{low:.4g}, {high:.4g}] {unit}".rstrip())
+            parts.append(f"{name}{value:.4g} {wording.interval(low, high)} {unit}".rstrip())
         return f"{self.label} = {', '.join(parts)}"
 
 
@@ -183,7 +183,7 @@ class Report:
         """The zeros of other runs' encoders by the corrected model: ``report.zeros_of(new).taken_off(new)`` is homed.
 
         :param data: recordings of the machine, columns in the order of those traced
-        :raises ValueError: no encoder has a zero that differs by run; no episode is as long as a window
+        :raises ValueError: no encoder has a zero that differs by run; a run has no episode as long as a window
         """
         if self.zeros is None:
             raise ValueError("no encoder's zero was found to differ by run; predict the runs as they are")

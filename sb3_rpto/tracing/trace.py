@@ -82,7 +82,8 @@ def trace(
     :param seed: of the split, the starts and the resampling
     :param candidates: kinds of effects to look for; default: all registered ones
     :param horizon: length of the windows in s; default: 0.5, or 0.8 where there are less than 15 s of data, shorter
-        for short episodes, and twice that to go on with where what was found leaves errors far above the noise
+        for short episodes, 0.1 where contacts come and go, and twice that to go on with where what was found leaves
+        errors far above the noise
     :param calibrate: recalibrate the threshold of selection on so many sets simulated from the fitted declared model
     :param threads: that simulate; 0: one for each core
     :param simulated: whether the recordings are of the model's own simulator, in its own steps in time; False: that is

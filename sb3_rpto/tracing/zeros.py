@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -186,16 +187,29 @@ def zeros_of(
     :param sigma: noise of the position columns, (m,)
     :param horizon: length of the windows in s
     :param joints: whose encoders they are
-    :raises ValueError: no episode is as long as a window
+    :raises ValueError: a run has no episode that is as long as a window
     """
-    windows = cut(simulation.model, data, sigma, horizon, TRAIN + SELECT)
+    windows = cut(simulation.model, data, sigma, horizon, sys.maxsize)
     names = tuple(dict.fromkeys(data.episodes[i].run for i in windows.episode))
+    without = sorted({episode.run for episode in data.episodes} - set(names))
+    if without:
+        raise ValueError(
+            f"runs {', '.join(without)} hold no window of {horizon:g} s: their zeros do not show; leave them out"
+        )
     run = np.array([names.index(data.episodes[i].run) for i in windows.episode])
+    most = max(LEAST, (TRAIN + SELECT) // len(names))
+    chosen = np.sort(np.concatenate([_spread(np.flatnonzero(run == r), most) for r in range(len(names))]))
+    windows, run = windows.take(chosen), run[chosen]
     problem = Problem(simulation, windows, [Scales()] * len(simulation.effects))
     homing = Homing(problem, run, len(names), _biases(simulation, joints))
     fit = homing.fit(homing.begin(values), homing.own.ravel())
     saved = 1 - float(np.median(fit.errors) / np.median(homing.score(homing.begin(values)).errors))
     return Zeros(tuple(joints), names, fit.values[homing.own], saved, np.nan)
+
+
+def _spread(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the rows, evenly chosen."""
+    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).round().astype(int)]
 
 
 def homed(set_up: SetUp, zeros: Zeros) -> SetUp:

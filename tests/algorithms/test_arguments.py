@@ -175,9 +175,11 @@ def test_effects_need_not_be_plain_data():
     [
         (TypeError, {"dynamics_kwargs": {"effects": LIBRARY["command_delay"]("slide", delay=0.03)}}, "a list of effe"),
         (TypeError, {"dynamics_kwargs": {"effects": ["command_delay"]}}, r"effects or their to_json\(\), not 'comm"),
+        (ValueError, {"dynamics_kwargs": {"effects": [{"kind": "command_delay"}]}}, "it lacks on, values"),
         (ValueError, {"dynamics_kwargs": {"max_steps": 2.5}}, "max_steps must be an integer"),
         (ValueError, {"dynamics_kwargs": {"threads": -1}}, "threads must be an integer that is not negative"),
         (TypeError, {"close_loop": None}, "close_loop must be True, False or a list"),
+        (TypeError, {"close_loop": 1}, "close_loop must be True, False or a list"),
     ],
 )
 def test_wrong_settings_of_a_simulator_are_refused_at_once(error, kwargs, said):

@@ -204,6 +204,35 @@ def test_transitions_that_hold_no_window_end_no_run(soon: None, monkeypatch: pyt
     assert made.loop.due(made, dynamics(made))
 
 
+def test_transitions_that_were_not_traced_are_tried_again_after_a_settled_trace(
+    soon: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = filled([])
+    assert made.loop is not None
+    made.loop.close(made, dynamics(made))
+    assert made.loop.found[-1]["verdict"] == "complete"
+    with monkeypatch.context() as patch:
+        patch.setattr(closing, "WINDOW", 1_000)
+        with pytest.warns(UserWarning, match="not traced"):
+            made.loop.close(made, dynamics(made))
+    assert not made.loop.due(made, dynamics(made))
+    append(made, [], 210)
+    assert made.loop.due(made, dynamics(made))
+
+
+def test_a_late_sensor_is_taken_into_phi_by_the_reports_word() -> None:
+    """What it saw before a step began, one-step errors do not know: they do not judge it."""
+    late = LIBRARY["sensor_delay"]("hinge", delay=0.09)
+    made = filled([late])
+    data = made.transitions("target")
+    traced = SimpleNamespace(effect=late, label=late.label, interval=np.array([[0.08], [0.1]]))
+    report = SimpleNamespace(declared=(), effects=(traced,), verdict="explained")
+    assert made.loop is not None
+    assert made.loop._take(made, dynamics(made), report, data, before=1e-3) == [late.label]  # type: ignore[arg-type]
+    assert dynamics(made).error(data) > 1e-3
+    assert made.loop.keeps_phi
+
+
 def test_windows_are_as_long_as_stretches_of_known_positions() -> None:
     def seen(*placed: list[int]) -> Measurements:
         episodes = [SimpleNamespace(placed=np.array(flags, dtype=bool)) for flags in placed]

@@ -157,6 +157,16 @@ def test_observations_are_those_of_the_corrected_environment() -> None:
     np.testing.assert_allclose(shown["observations"][:, 2], plain["observations"][:, 2], atol=1e-9)  # as measured
 
 
+def test_a_late_sensor_shows_what_the_log_saw() -> None:
+    time = 0.01 * np.arange(100)
+    columns = {"time": time, "qpos.slider": 0.1 * np.sin(3 * time), "ctrl.slide": 0 * time}
+    columns |= {"qpos.hinge": 0.02 * np.sin(9 * time), "qpos.hinge2": 0.02 * np.cos(3 * time)}
+    measured, env = Measurements.from_tables({"log": columns}), gym.make("InvertedDoublePendulum-v5")
+    plain = transitions(measured, env)
+    shown = transitions(measured, env, [LIBRARY["sensor_delay"]("hinge", delay=0.08)])
+    np.testing.assert_allclose(shown["observations"][:, :8], plain["observations"][:, :8], atol=1e-9)
+
+
 def test_observation_wrappers_are_applied() -> None:
     env = gym.make(TASK)
     twice = gym.wrappers.TransformObservation(env, lambda o: 2 * o, env.observation_space)

@@ -104,6 +104,19 @@ def test_a_corrected_model_tells_the_zeros_of_other_runs() -> None:
         traced(0.0, 0.0, 0.05).zeros_of(new)
 
 
+def test_every_run_is_told_its_zero_and_one_without_a_window_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_rpto.tracing.zeros.TRAIN", 2)
+    monkeypatch.setattr("sb3_rpto.tracing.zeros.SELECT", 1)
+    report, zeros = traced(0.0, 1.0), [0.07, -0.05, 0.02, 0.04]
+    new = shifted(recorded([], compiled(), 4, 4.0, seed=9), zeros)
+    found = report.zeros_of(new)
+    assert found.runs == ("0", "1", "2", "3")
+    np.testing.assert_allclose(found.offsets[:, 0], zeros, atol=5e-3)
+    short = new.episodes[-1].part_of(slice(20), after_gap=False)
+    with pytest.raises(ValueError, match="runs 3 hold no window of"):
+        report.zeros_of(replace(new, episodes=[*new.episodes[:-1], short]))
+
+
 def test_of_a_run_that_is_too_short_for_a_window_no_zero_is_said() -> None:
     data = shifted(runs(), ZEROS)
     short = data.episodes[-1].part_of(slice(40), after_gap=False)
