@@ -21,8 +21,8 @@ def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:
     """
     if not isinstance(env, gym.Env):
         raise TypeError(
-            f"env must be a gymnasium environment, not {type(env).__name__}; correct each one before "
-            "stable_baselines3.common.env_util.make_vec_env stacks them"
+            f"env must be a gymnasium environment, not {type(env).__name__}; correct those of a VecEnv before "
+            "make_vec_env stacks them; of an MJCF file save the report, its model.xml is the corrected one"
         )
     twin = copy_env(env)
     if twin is None:

@@ -119,6 +119,7 @@ def runs_of(file: str, table: Table) -> dict[str | None, dict[str, np.ndarray]]:
         except (TypeError, ValueError):
             each = list(enumerate(np.asarray(values)))
             row, odd = next((pair for pair in each if not _is_number(pair[1])), each[0])
+            odd = odd.item() if isinstance(odd, np.generic) else odd
             remedy = "give seconds since the start of the run" if name == "time" else "correct or remove it"
             raise ValueError(
                 f"{file}: column {name!r} holds {odd!r}, which is no number, in row {row} (counted from 0 below the "
@@ -256,7 +257,8 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
     if spread > checks.JITTER:
         say(
             "jitter",
-            f"steps vary by {spread:.0%} around their median of {np.median(np.diff(time)):.4g} s; kept as they are",
+            f"steps vary by {spread:.0%} around their median of {np.median(np.diff(time)):.4g} s; kept as they are: "
+            "where the logger, not the robot, was late, give the times at which the samples were taken",
         )
     rows = checks.held(episode.qpos)
     if rows is not None:

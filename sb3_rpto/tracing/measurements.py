@@ -92,6 +92,7 @@ class Measurements:
 
         :param paths: a path, a glob pattern, or several of them; a header and one row a sample, in SI units
         :raises FileNotFoundError: nothing matches
+        :raises TypeError: a table in memory
         :raises ValueError: an empty file, a row of another length than the header, a broken gzip file, other text than
             UTF-8, or data that break the file format (see :meth:`from_tables`)
         """
@@ -373,6 +374,8 @@ def _read_csv(path: str) -> dict[str, np.ndarray]:
 
 
 def _expand(paths: Paths) -> list[str]:
+    if isinstance(paths, Mapping) or hasattr(paths, "columns"):
+        raise TypeError("paths must name files; for a table in memory use Measurements.from_tables({'run': table})")
     patterns = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
     found: list[str] = []
     for pattern in [os.fspath(p) for p in patterns]:

@@ -274,6 +274,19 @@ def test_a_folder_is_no_file(tmp_path):
         Measurements.from_csv(str(tmp_path))
 
 
+def test_a_table_in_memory_is_no_file():
+    with pytest.raises(TypeError, match="for a table in memory use Measurements.from_tables"):
+        Measurements.from_csv(swing())
+
+
+def test_text_among_numbers_is_shown_as_it_is():
+    table = swing()
+    table["qpos.hinge"] = table["qpos.hinge"].astype(str)
+    table["qpos.hinge"][3] = "n/a"
+    with pytest.raises(ValueError, match="holds 'n/a', which is no number, in row 3"):
+        Measurements.from_tables({"a": table})
+
+
 def test_short_stretch_is_set_aside_with_a_finding():
     table = swing()
     table["time"][197:] += 0.2

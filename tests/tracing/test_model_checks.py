@@ -226,7 +226,7 @@ def test_names_that_the_model_has_not():
     check({"ctrl.first": "ctrl.fist"}, r"no actuator 'fist'; did you mean 'first'")
     check({"ctrl.first": "ctrl.zz"}, r"no actuator 'zz'; it has first, second")
     check({"qpos.elbow": "", "qvel.elbow": ""}, r"joint 'elbow' has no column 'qpos.elbow'; record it")
-    check({"ctrl.first": ""}, r"actuator 'first' has no column 'ctrl.first'; add it")
+    check({"ctrl.first": ""}, r"actuator 'first' has no column 'ctrl.first'; record the command")
 
 
 def test_a_ball_joint_is_no_hinge():
