@@ -265,7 +265,8 @@ class Declared(Effect):
             raise ValueError(f"{name}: the bounds [{lower:g}, {upper:g}] are the wrong way round; give low:high")
         if not lower <= nominal <= upper or lower == upper:
             raise ValueError(
-                f"{name}: the bounds [{lower:g}, {upper:g}] do not hold the nominal value {nominal:g}; give low:high around it"
+                f"{name}: the bounds [{lower:g}, {upper:g}] do not hold the nominal value {nominal:g}; give low:high "
+                "around it"
             )
         self._take(name, nominal, lower, upper)
         super().__init__("")

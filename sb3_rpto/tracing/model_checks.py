@@ -96,7 +96,7 @@ def check_names(model: mujoco.MjModel, data: Measurements) -> None:
                         "record it, take the joint out of the model or, where an equality constraint ties it to "
                         "others, add the column that follows from theirs"
                         if prefix == "qpos"
-                        else "record the command that was sent; a column of 0 is right only for an actuator that was off"
+                        else "record the command that was sent; a column of 0 is right where the actuator was off alone"
                     )
                 )
             if sorted(found) != sorted(expected):

@@ -275,7 +275,7 @@ def test_a_folder_is_no_file(tmp_path):
 
 
 def test_a_table_in_memory_is_no_file():
-    with pytest.raises(TypeError, match="for a table in memory use Measurements.from_tables"):
+    with pytest.raises(TypeError, match="for a table in memory use"):
         Measurements.from_csv(swing())
 
 
