@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects.declared import Declared
-from sb3_rpto.effects.effect import LIBRARY, Effect
+from sb3_rpto.effects.effect import LIBRARY, Effect, from_json
 from sb3_rpto.effects.mjcf import restore, rounded, write_mjcf
 from sb3_rpto.effects.model import ModelSource, differing, load_model, same_layout
 from sb3_rpto.effects.names import near
@@ -212,7 +212,7 @@ def _describe(effect: Effect, model: mujoco.MjModel) -> dict[str, Any]:
 
 def _rebuild(entry: Mapping[str, Any], model: mujoco.MjModel, nominal: Mapping[str, float] | None = None) -> Effect:
     """The effect of an entry; ``nominal`` where ``model`` is no longer the one that it changes."""
-    kind, place, values = entry["kind"], entry["on"], entry["values"]
+    kind, values = entry["kind"], entry["values"]
     if kind == Declared.kind:
         ((name, value),) = values.items()
         return Declared(model, name, (-np.inf, np.inf), (nominal or {}).get(name)).with_values(np.array([value]))
@@ -221,7 +221,7 @@ def _rebuild(entry: Mapping[str, Any], model: mujoco.MjModel, nominal: Mapping[s
             f"no effect {kind!r} is registered ({near(kind, LIBRARY)}); import the module with "
             "its class, decorated with @sb3_rpto.effects.register, before loading"
         )
-    return LIBRARY[kind](place, **values)
+    return from_json(entry)
 
 
 def _write(path: Path, content: bytes) -> None:
