@@ -14,9 +14,13 @@ from sb3_rpto.effects.stance import StandingEnv
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.looping import Looping
 
-#: Episodes of a rehearsal, always from the same starts, and so many more where it seems to beat the best by this share:
-#: the luckiest of many policies would be taken otherwise. Their most steps where the task has no end.
-EPISODES, MORE, GAIN, LONGEST, SEED = 25, 75, 1e-3, 1_000, 30_000
+#: Episodes of a rehearsal, always from the same starts. After a few a policy that is clearly behind the best one plays
+#: no further, nor does after some more one that is not ahead, or clearly so. A small lead needs all of them: of many
+#: policies the luckiest would be taken otherwise. Their most steps where the task has no end.
+FEW, SOME, ALL, LONGEST, SEED = 5, 25, 100, 1_000, 30_000
+#: A lead is none by less than this share of what the best policy earns (root mean square of its episodes), and clear by
+#: more than :data:`LOST` of it and so many standard errors.
+GAIN, SURE = 1e-3, 2.0
 #: Updates of the policy between two rehearsals.
 EVERY = 2_000
 #: A policy that earns less than the best by more than this share and the standard error of their difference learns no
@@ -37,8 +41,9 @@ class Rehearsals:
     def __init__(self) -> None:
         #: mean returns of the best policy, and of the last one as long as it acts
         self.best = self.last = -np.inf
-        self._errors = 0.0, 0.0  # standard errors of both
-        self._first = -np.inf  # mean return of the best one's first episodes
+        self._returns = np.empty(0)  # of the best one's episodes
+        #: whether the last one is the best; if not, by how much it is ahead from the same starts, and how sure that is
+        self._leads, self._lead, self._error = True, 0.0, 0.0
         #: taken so far, of the source's
         self.steps = 0
         self._phi: np.ndarray | None = None
@@ -57,33 +62,41 @@ class Rehearsals:
         """Play, and keep the policy if it is the best so far."""
         normaliser = model.get_vec_normalize_env()  # where its statistics move, so does what the best one earns
         if self._has_moved(dynamics) or (normaliser is not None and normaliser.training):
-            self._rehearse_best(model, dynamics)
-        returns = self._play(model, dynamics, range(EPISODES))
-        if returns.mean() > self._first + GAIN * abs(self._first):  # from the same starts
-            returns = np.concatenate([returns, self._play(model, dynamics, range(EPISODES, EPISODES + MORE))])
-        self.last, error = _mean(returns)
-        self._errors = self._errors[0], error
+            model.snapshots.setdefault("simulator", model.snapshots["source"])
+            self._phi, self._names, self._returns = dynamics.values.copy(), list(dynamics.names), np.empty(0)
+        returns = np.empty(0)
+        for episodes in (FEW, SOME, ALL):
+            if len(self._returns) < episodes:
+                self._rehearse_best(model, dynamics, episodes)
+            returns = np.append(returns, self._play(model, dynamics, range(len(returns), episodes)))
+            self._lead, self._error = _mean(returns - self._returns[:episodes])
+            self._leads = self._lead > GAIN * self._size()
+            clear = abs(self._lead) > LOST * self._size() + SURE * self._error
+            # A few do not show that a policy falls now and then, so that no lead is clear by them.
+            if (clear and not self._leads) if episodes == FEW else (clear or not self._leads):
+                break
+        self.last = float(returns.mean())
         model.logger.record("source/rehearsed", self.last)
-        if self.last >= self.best:
-            self.best, self._errors, self._first = self.last, (error, error), float(returns[:EPISODES].mean())
+        if self._leads:
+            self.best, self._returns = self.last, returns
             model.take_snapshot("simulator")
         self._at_update = model._n_updates  # not before: an interrupted one is played again
 
     def clearly_worse(self) -> bool:
         """Whether the last policy earned much less than the best one, and more so than episodes differ."""
-        return self.last < self.best - LOST * abs(self.best) - float(np.hypot(*self._errors))
+        return not self._leads and self._lead < -LOST * self._size() - self._error
 
     def go_back(self, model: Looping) -> None:
         """Take up the best policy again, unless the last one is."""
-        if self.last < self.best:
+        if not self._leads:
             model.rollback("simulator")
             if model.verbose:
                 print(f"back to a policy that earns {self.best:.5g} in the simulator; the last one: {self.last:.5g}")
-            self.last = self.best
+            self.last, self._leads = self.best, True
 
     def leave_best(self, model: Looping) -> None:
         """Let the best policy act, unless the last one is, which is kept to go on learning."""
-        if self.last < self.best:
+        if not self._leads:
             self.set_aside(model)
 
     def set_aside(self, model: Looping) -> None:
@@ -93,26 +106,28 @@ class Rehearsals:
         if "simulator" in model.snapshots:  # not so before the first rehearsal
             model.rollback("simulator")
         model.snapshots["learner"] = learner
-        self.last = self.best
+        self.last, self._leads = self.best, True
 
     def take_up_learner(self, model: Looping) -> None:
         """Go on with the policy that learns, where another one acts."""
         if "learner" in model.snapshots:
             model.rollback("learner")
 
-    def _rehearse_best(self, model: Looping, dynamics: PhysicalDynamics) -> None:
-        """The best policy so far, in the simulator as it is now; in the beginning, the one from the source."""
-        model.snapshots.setdefault("simulator", model.snapshots["source"])
+    def _rehearse_best(self, model: Looping, dynamics: PhysicalDynamics, episodes: int) -> None:
+        """Let the best policy so far, in the beginning the one from the source, play until it has so many episodes."""
         model.take_snapshot("present")
         try:
             model.rollback("simulator")
-            returns = self._play(model, dynamics, range(EPISODES + MORE))
-            self.best, error = _mean(returns)
-            self._errors, self._first = (error, self._errors[1]), float(returns[:EPISODES].mean())
+            further = self._play(model, dynamics, range(len(self._returns), episodes))
+            self._returns = np.append(self._returns, further)
+            self.best = float(self._returns.mean())
         finally:
             model.rollback("present")
             del model.snapshots["present"]
-        self._phi, self._names = dynamics.values.copy(), list(dynamics.names)
+
+    def _size(self) -> float:
+        """Of what the best policy earns; its mean may be near zero."""
+        return float(np.sqrt(np.mean(self._returns**2)))
 
     def _has_moved(self, dynamics: PhysicalDynamics) -> bool:
         if self._phi is None or self._names != dynamics.names:
@@ -143,6 +158,6 @@ class Rehearsals:
         return returns
 
 
-def _mean(returns: np.ndarray) -> tuple[float, float]:
+def _mean(values: np.ndarray) -> tuple[float, float]:
     """Mean and its standard error."""
-    return float(returns.mean()), float(returns.std() / np.sqrt(len(returns)))
+    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
