@@ -49,7 +49,10 @@ WORTH = 0.9
 #: With D_source made anew the policy learns in the corrected simulator what it can for nothing, before the next target
 #: step: in rounds of so many source steps, until so many in a row earned no more than the best one and this share of
 #: it, or ``retrain_steps`` are taken. A task that is solved earns a trifle more for ever.
-ROUND, PATIENCE, RISE = 20_000, 2, 1e-3
+ROUND, PATIENCE, RISE = 160_000, 2, 1e-3
+#: Meanwhile so many times as many source steps are taken for the same updates, which cost far more: of few steps of its
+#: own a policy that is new to a simulator learns slowly, or loses what it knows.
+FRESH = 8
 #: Width of a normal distribution's 95 % interval, in standard deviations.
 WIDTH = 3.92
 #: A corrected simulator must stay finite for so many steps from states of the target, as the uncorrected one does.
@@ -404,10 +407,10 @@ def _from_resets(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
     return observations, np.array(actions)
 
 
-def learn_for_a_step(model: Looping) -> int:
-    """Steps 3, 5 and 6 of a round with one target step, but for the fit; the number of source steps."""
+def learn_for_a_step(model: Looping, times: int = 1) -> int:
+    """Steps 3 (so many times), 5 and 6 of a round with one target step, but for the fit; the number of source steps."""
     assert model._source_world is not None
-    taken = model._source_world.interact(model, int(model.source_steps))
+    taken = model._source_world.interact(model, times * int(model.source_steps))
     model.source_timesteps += taken
     model.train(model.updates_per_step, model.batch_size)
     return taken
@@ -428,7 +431,7 @@ def learn_in_source(model: Looping, loop: LoopCloser) -> None:
         source.returns.clear()
         end = min(steps + ROUND, model.retrain_steps)
         while steps < end:
-            steps += learn_for_a_step(model)
+            steps += learn_for_a_step(model, FRESH)
             if loop.rehearsals.due(model._n_updates):
                 loop.rehearse(model)
         # Where no episode ended there is nothing to judge by, and learning goes on.

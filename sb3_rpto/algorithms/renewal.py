@@ -8,8 +8,8 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 
 #: Another simulator made D_source where the present one errs by so much on the oldest so many of its transitions.
 OTHER, OLDEST = 0.02, 500
-#: Source steps that are taken anew.
-FILL = 1_000
+#: Source steps that are taken anew: of all of an episode, not of beginnings alone.
+FILL = 16_000
 
 
 def outdated(model: Looping, dynamics: PhysicalDynamics) -> bool:

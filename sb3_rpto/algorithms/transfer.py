@@ -63,7 +63,7 @@ class TransferAlgorithm(Looping):
         none, so that the declared numbers are traced and the policy learns on. The reports are in
         ``model.loop.reports`` (with Measurements also where only the declared numbers are fitted)
     :param retrain_steps: source steps after a trace, at most: in the corrected simulator, before the next target step,
-        as long as the policy gets better there. Some get much better with 300,000 (docs/results.md, Hopper)
+        as long as the policy gets better there; eight of them for each update with the default preset
     :param weighting: RTO's weight: "paper", "centred", "value_aware", or None (plain supervised learning)
     :param weight_floor: epsilon of the paper: the smallest weight, above 0 or equal to it
     :param real_ratio: share of target transitions in the critic's batches, in [0, 1); 0 in the paper
@@ -124,7 +124,7 @@ class TransferAlgorithm(Looping):
         dynamics_kwargs: dict[str, Any] | None = None,
         declared: Sequence[str] = (),
         close_loop: bool | Sequence[str] = False,
-        retrain_steps: int = 100_000,
+        retrain_steps: int = 800_000,
         weighting: WeightingName | None = "paper",
         weight_floor: float = 0.5,
         real_ratio: float = 0.05,

@@ -691,7 +691,7 @@ GAINS = [
 def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
     earns: list[float], rounds: int, judges: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(closing, "ROUND", 20)
+    monkeypatch.setattr(closing, "ROUND", 160)
     updates: list[int] = []
     # What does not count earns ever more.
     source, judge = Scripted([float(i) for i in range(9)] if judges else earns), Judge(earns, judges)
@@ -700,7 +700,7 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
         _n_updates=0,
         updates_per_step=30,
         source_steps=20,
-        retrain_steps=160,
+        retrain_steps=1_280,
         batch_size=32,
         source_timesteps=5,
         verbose=0,
@@ -709,8 +709,8 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
     closing.learn_in_source(made, judge)  # type: ignore[arg-type]
     assert updates == [30] * rounds
     assert judge.asked == 1 + rounds + 1
-    assert source.asked == [20] * rounds  # in the source each call draws gSDE's noise anew
-    assert made.source_timesteps == 5 + 20 * rounds
+    assert source.asked == [8 * 20] * rounds  # in the source each call draws gSDE's noise anew
+    assert made.source_timesteps == 5 + 8 * 20 * rounds
 
 
 # --- rehearsals -------------------------------------------------------------------------------------------------------
