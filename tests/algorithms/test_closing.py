@@ -375,7 +375,8 @@ def test_what_other_declared_numbers_produced_is_dropped_too(soon: None) -> None
     assert learned_from() == made.replay_buffer.source.size()
 
 
-def test_renewed_data_are_the_simulators_own_where_commands_are_late() -> None:
+def test_renewed_data_are_the_simulators_own_where_commands_are_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(renewal, "FILL", 1_000)
     late = LIBRARY["command_delay"]("slide", delay=0.05).to_json()
     made = model([], dynamics_kwargs={"effects": [late]})
     made.learn(1, source_timesteps=63)
