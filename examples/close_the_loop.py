@@ -65,7 +65,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--target", type=int, default=0, help="another number is another target")
     parser.add_argument("--steps", type=int, default=250, help="budget of target steps; more than 200, to be traced")
-    parser.add_argument("--retrain-steps", type=int, default=800_000, help="in the corrected simulator, at most")
+    parser.add_argument("--retrain-steps", type=int, default=320_000, help="in the corrected simulator, at most")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/double_pendulum"))
     arguments = parser.parse_args()

@@ -49,7 +49,7 @@ WORTH = 0.9
 #: With D_source made anew the policy learns in the corrected simulator what it can for nothing, before the next target
 #: step: in rounds of so many source steps, until so many in a row earned no more than the best one and this share of
 #: it, or ``retrain_steps`` are taken. A task that is solved earns a trifle more for ever.
-ROUND, PATIENCE, RISE = 160_000, 2, 1e-3
+ROUND, PATIENCE, RISE = 80_000, 2, 1e-3
 #: Meanwhile so many times as many source steps are taken for the same updates, which cost far more: of few steps of its
 #: own a policy that is new to a simulator learns slowly, or loses what it knows.
 FRESH = 8

@@ -124,7 +124,7 @@ class TransferAlgorithm(Looping):
         dynamics_kwargs: dict[str, Any] | None = None,
         declared: Sequence[str] = (),
         close_loop: bool | Sequence[str] = False,
-        retrain_steps: int = 800_000,
+        retrain_steps: int = 320_000,
         weighting: WeightingName | None = "paper",
         weight_floor: float = 0.5,
         real_ratio: float = 0.05,
