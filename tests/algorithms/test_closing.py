@@ -950,6 +950,18 @@ def test_the_actor_sees_the_simulators_states_alone_where_it_accounts_for_the_ta
     assert worlds == ({-1.0} if accounts else {-1.0, 1.0})
 
 
+@pytest.mark.parametrize(("accounts", "share"), [(True, 0.0), (False, 0.5)])
+def test_the_critic_sees_no_estimated_states_where_the_simulator_accounts_for_a_log(
+    accounts: bool, share: float
+) -> None:
+    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
+    made = model([], target_data=measured, close_loop=False, real_ratio=0.5).learn(40, source_timesteps=0)
+    assert made.loop is not None
+    made.loop.accounts = accounts
+    made.replay_buffer.source.rewards[:], made.replay_buffer.target.rewards[:] = 0, 1
+    assert [float(batch.rewards.mean()) for batch in made.critic_batches(3, 16)] == [share] * 3
+
+
 def test_after_a_log_the_best_policy_is_left_and_the_last_one_goes_on_learning(monkeypatch: pytest.MonkeyPatch) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)
