@@ -41,6 +41,7 @@ SECRETS = (
     ("command_delay", "slide", "delay", (0.015, 0.022)),
     ("torque_offset", "hinge", "offset", (0.8, 1.2)),
 )
+EIGHT = 8  # steps in the corrected simulator for each of RPTO's updates, which cost far more
 COLUMNS = ["time", *(f"{what}.{joint}" for what in NOISE for joint in ("slider", "hinge", "hinge2")), "ctrl.slide"]
 
 
@@ -131,10 +132,11 @@ def by_rpto(source: Path, data: Measurements, kinds: list[str] | None, steps: in
         dynamics="physical",
         declared=DECLARED,
         close_loop=kinds or True,
+        source_steps=EIGHT * 20,  # and 20 updates
         seed=seed,
         device="cpu",
     )
-    model.learn(steps)
+    model.learn(EIGHT * steps)
     return model, model.loop.reports[0]
 
 
@@ -163,7 +165,12 @@ def main() -> None:
         "--agent", choices=("sac", "rpto"), default="sac", help="what goes on in the corrected simulator"
     )
     parser.add_argument("--attempts", type=int, default=16, help="recorded on the robot")
-    parser.add_argument("--steps", type=int, default=8_000, help="of learning in the corrected simulator, at most")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=8_000,
+        help="of learning in the corrected simulator, at most; RPTO takes eight times as many for as many updates",
+    )
     parser.add_argument("--source-steps", type=int, default=40_000, help="of learning before, at most")
     parser.add_argument("--episodes", type=int, default=10, help="of an evaluation on the robot")
     parser.add_argument("--out", type=Path, default=Path("runs/robot_log_to_policy"))

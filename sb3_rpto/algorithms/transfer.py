@@ -66,7 +66,8 @@ class TransferAlgorithm(Looping):
         as long as the policy gets better there; eight of them for each update with the default preset
     :param weighting: RTO's weight: "paper", "centred", "value_aware", or None (plain supervised learning)
     :param weight_floor: epsilon of the paper: the smallest weight, above 0 or equal to it
-    :param real_ratio: share of target transitions in the critic's batches, in [0, 1); 0 in the paper
+    :param real_ratio: share of target transitions in the critic's batches, in [0, 1); 0 in the paper, and
+        where the target is a robot's log that the simulator accounts for
     :param rollout_start: where one-step branches start: "target", "source" or "mix"
     :param source_steps: source transitions per target step; "auto" leaves it to the preset
     :param model_train_freq: target steps between two fits of the dynamics
