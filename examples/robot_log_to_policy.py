@@ -41,7 +41,7 @@ SECRETS = (
     ("command_delay", "slide", "delay", (0.015, 0.022)),
     ("torque_offset", "hinge", "offset", (0.8, 1.2)),
 )
-EIGHT = 8  # steps in the corrected simulator for each of RPTO's updates, which cost far more
+STEPS_PER_UPDATE = 8  # of RPTO, in the corrected simulator: they cost little beside updates
 COLUMNS = ["time", *(f"{what}.{joint}" for what in NOISE for joint in ("slider", "hinge", "hinge2")), "ctrl.slide"]
 
 
@@ -132,11 +132,11 @@ def by_rpto(source: Path, data: Measurements, kinds: list[str] | None, steps: in
         dynamics="physical",
         declared=DECLARED,
         close_loop=kinds or True,
-        source_steps=EIGHT * 20,  # and 20 updates
+        source_steps=STEPS_PER_UPDATE * 20,  # for the preset's 20 updates
         seed=seed,
         device="cpu",
     )
-    model.learn(EIGHT * steps)
+    model.learn(STEPS_PER_UPDATE * steps)
     return model, model.loop.reports[0]
 
 
