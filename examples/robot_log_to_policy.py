@@ -41,7 +41,7 @@ SECRETS = (
     ("command_delay", "slide", "delay", (0.015, 0.022)),
     ("torque_offset", "hinge", "offset", (0.8, 1.2)),
 )
-STEPS_PER_UPDATE = 8  # of RPTO, in the corrected simulator: they cost little beside updates
+STEPS_PER_UPDATE = 8  # that RPTO takes in a corrected simulator, as updates cost far more
 COLUMNS = ["time", *(f"{what}.{joint}" for what in NOISE for joint in ("slider", "hinge", "hinge2")), "ctrl.slide"]
 
 
@@ -132,7 +132,6 @@ def by_rpto(source: Path, data: Measurements, kinds: list[str] | None, steps: in
         dynamics="physical",
         declared=DECLARED,
         close_loop=kinds or True,
-        source_steps=STEPS_PER_UPDATE * 20,  # for the preset's 20 updates
         seed=seed,
         device="cpu",
     )

@@ -392,9 +392,13 @@ class TwoWorlds(PolicySnapshots):
         if self.target_env is not None and self._callback is not None and find_ledger(self.target_env).unstored:
             self.store_step(self._callback.locals)
 
+    def _steps_of_round(self) -> int:
+        """Source steps for each target step, or for what stands in for one when the target is a log."""
+        return int(self.source_steps)
+
     def _count_source_steps(self, callback: BaseCallback) -> bool:
         """What stands in for a target step when the target is a log: ``num_timesteps`` counts source steps."""
-        self.num_timesteps += min(int(self.source_steps), self._steps_left())
+        self.num_timesteps += min(self._steps_of_round(), self._steps_left())
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         callback.update_locals({**locals(), "dones": np.zeros(1, dtype=bool), "infos": [{}]})  # no episode ends
         return callback.on_step()

@@ -11,6 +11,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms.looping import FRESH, Looping
 from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.renewal import outdated, renew_source
 from sb3_rpto.algorithms.source import EpisodeSource
@@ -27,7 +28,6 @@ from sb3_rpto.tracing.zeros import Zeros
 
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.bookkeeping import TwoWorlds
-    from sb3_rpto.algorithms.looping import Looping
 
 #: Target transitions before the first trace, and new ones before another.
 FIRST, AGAIN = 200, 200
@@ -50,9 +50,6 @@ WORTH = 0.9
 #: step: in rounds of so many source steps, until so many in a row earned no more than the best one and this share of
 #: it, or ``retrain_steps`` are taken. A task that is solved earns a trifle more for ever.
 ROUND, PATIENCE, RISE = 80_000, 2, 1e-3
-#: Meanwhile so many times as many source steps are taken for the same updates, which cost far more: of few steps of its
-#: own a policy that is new to a simulator learns slowly, or loses what it knows.
-FRESH = 8
 #: Width of a normal distribution's 95 % interval, in standard deviations.
 WIDTH = 3.92
 #: A corrected simulator must stay finite for so many steps from states of the target, as the uncorrected one does.

@@ -8,6 +8,10 @@ from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.tracing import Measurements
 
+#: In a simulator that is new to the policy so many times as many source steps are taken for the same updates, which
+#: cost far more: of few steps of its own a policy learns slowly there, or loses what it knows.
+FRESH = 8
+
 
 class Looping(Resumable):
     """Calls :class:`~sb3_rpto.algorithms.closing.LoopCloser`, where there is one, when it is its turn.
@@ -38,6 +42,10 @@ class Looping(Resumable):
             self.fit_dynamics()
         else:
             super().update()
+
+    def _steps_of_round(self) -> int:
+        """With a log for a target: many where the simulator accounts for it, as the policy learns from them alone."""
+        return super()._steps_of_round() * (FRESH if self._offline and self._worlds_are_alike() else 1)
 
     def _worlds_are_alike(self) -> bool:
         return self.loop is not None and self.loop.accounts

@@ -397,7 +397,7 @@ class TransferAlgorithm(Looping):
         if self.learns_at_fits():
             return
         assert self._source_world is not None  # learn() has made it
-        n_steps = self._collected * int(self.source_steps)
+        n_steps = self._collected * self._steps_of_round()
         if self._offline:  # the budget is one of source steps then
             n_steps = min(n_steps, self._steps_left())
         self.source_timesteps += self._source_world.interact(self, n_steps)

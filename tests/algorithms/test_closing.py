@@ -962,6 +962,21 @@ def test_the_critic_sees_no_estimated_states_where_the_simulator_accounts_for_a_
     assert [float(batch.rewards.mean()) for batch in made.critic_batches(3, 16)] == [share] * 3
 
 
+@pytest.mark.parametrize(("accounts", "times"), [(True, 8), (False, 1)])
+def test_many_steps_are_taken_for_each_update_where_the_simulator_accounts_for_a_log(
+    accounts: bool, times: int
+) -> None:
+    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
+    made = model([], target_data=measured, close_loop=False, source_steps=5).learn(40, source_timesteps=0)
+    assert made.loop is not None
+    made.loop.accounts = accounts
+    taken, updates = made.source_timesteps - made.loop.rehearsals.steps, made._n_updates
+    made.learn(100, reset_num_timesteps=False)
+    assert made.num_timesteps == 140  # the budget counts each of them
+    assert made.source_timesteps - made.loop.rehearsals.steps - taken == 100
+    assert made._n_updates - updates == 100 // 5 // times + bool(100 // 5 % times)
+
+
 def test_after_a_log_the_best_policy_is_left_and_the_last_one_goes_on_learning(monkeypatch: pytest.MonkeyPatch) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)
