@@ -69,7 +69,8 @@ class TransferAlgorithm(Looping):
     :param real_ratio: share of target transitions in the critic's batches, in [0, 1); 0 in the paper, and
         where the target is a robot's log that the simulator accounts for
     :param rollout_start: where one-step branches start: "target", "source" or "mix"
-    :param source_steps: source transitions per target step; "auto" leaves it to the preset
+    :param source_steps: source transitions per target step, and in how many copies of a simulator they are taken;
+        "auto" leaves it to the preset
     :param model_train_freq: target steps between two fits of the dynamics
     :raises ValueError: for an unknown preset, backend, weighting or start, a value out of range, a target equal to the
         source or with other spaces
