@@ -7,7 +7,7 @@ A policy is trained in the simulator (kept in runs/double_pendulum for the next 
 and mass are off, which is declared, and in which something acts that nobody declared. RPTO may take a few hundred steps
 there. From the first 200 it traces what is missing, adds it to the simulator, and learns on in it; plain SAC learns
 from the target alone. Printed: the report, both returns with what they cost, and at the end what is true of the target.
-Some ten minutes on one core the first time.
+Ten to forty minutes on one core the first time.
 """
 
 from __future__ import annotations

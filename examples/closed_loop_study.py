@@ -1,6 +1,6 @@
 """What closing the loop is worth, on four simulated robots with shifted targets.
 
-    python examples/closed_loop_study.py --quick      # one task, one seed, 260 target steps: shows that it works
+    python examples/closed_loop_study.py --quick      # one task, one seed, 250 target steps: shows that it works
     python examples/closed_loop_study.py              # five seeds, resumable; days on two cores, so see --help
 
 Targets differ from their source by numbers that are declared (lengths, masses, friction by up to 20 %), by these and
@@ -15,6 +15,8 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import shlex
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
@@ -35,7 +37,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=list(study.TASKS), choices=list(study.TASKS))
     parser.add_argument("--shifts", nargs="+", default=list(study.SHIFTS), choices=study.SHIFTS)
     parser.add_argument("--methods", nargs="+", default=list(study.METHODS), choices=list(study.METHODS))
-    parser.add_argument("--targets", nargs="+", type=int, default=list(study.TARGETS))
+    parser.add_argument("--targets", nargs="+", type=int, default=list(study.TARGETS), choices=study.TARGETS)
     parser.add_argument("--seeds", type=int, default=5, help="how many (default: 5); 0: only write the tables")
     parser.add_argument("--sensors", type=float, default=0.0, help="noise of the target's positions in rad or m")
     parser.add_argument("--budget", type=int, help="most target steps of a run (default: the study's)")
@@ -49,7 +51,7 @@ def main() -> None:
     if a.quick:
         a.tasks, a.shifts, a.targets, a.seeds, a.no_oracle = ["double-pendulum"], ["undeclared"], [0], 1, True
         a.methods, a.runs, episodes = ["zero-shot", "RPTO-physical, closed loop"], a.runs / "quick", 2
-        a.budget = a.budget or 260
+        a.budget = a.budget or 250
     out = a.out or (a.runs if a.quick else Path(__file__).parent / "results" / name)
     for folder in (a.runs, out):
         folder.mkdir(parents=True, exist_ok=True)
@@ -68,6 +70,8 @@ def main() -> None:
             future.result()
 
     rows, oracles = study.collected(a.runs), study.oracles(a.runs)
+    if rows.empty:
+        parser.error(f"--runs: {a.runs} holds no run; ask for some by --seeds")
     rows.to_csv(out / "runs.csv", index=False)
     tables = {"summary": study.summary(rows, oracles), "steps_to_90": study.steps_to(rows, oracles)}
     if oracles:
@@ -77,7 +81,7 @@ def main() -> None:
         table.round(4).to_csv(out / f"{name}.csv", index=False)
     packages = ("sb3-rpto", "torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
     manifest = {
-        "command": "python examples/closed_loop_study.py" + (" --quick" if a.quick else ""),
+        "command": " ".join(["python examples/closed_loop_study.py", *map(shlex.quote, sys.argv[1:])]),
         "episodes": episodes,
         "budget": a.budget,
         "sensors": a.sensors,

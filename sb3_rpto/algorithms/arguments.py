@@ -19,7 +19,7 @@ from sb3_rpto.algorithms.bookkeeping import TwoWorlds
 from sb3_rpto.algorithms.worlds import members
 from sb3_rpto.dynamics.factory import BACKENDS, is_mujoco
 from sb3_rpto.dynamics.weights import WEIGHTINGS
-from sb3_rpto.effects import LIBRARY, Effect, from_json
+from sb3_rpto.effects import LIBRARY, Declared, Effect, from_json
 from sb3_rpto.effects.library import given
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.names import near
@@ -104,6 +104,11 @@ def plain_effects(kwargs: dict[str, Any]) -> dict[str, Any]:
         raise TypeError(f"dynamics_kwargs['effects'] must be a list of effects, not {type(effects).__name__}")
     plain = [e.to_json() if isinstance(e, Effect) else e for e in effects]
     for effect in plain:
+        if isinstance(effect, Mapping) and effect.get("kind") == Declared.kind:
+            raise ValueError(
+                f"dynamics_kwargs['effects'] holds declared numbers, {', '.join(effect.get('values', ()))}: known "
+                "effects belong here; name those in declared= and leave them out"
+            )
         if not isinstance(effect, Mapping):
             raise TypeError(f"dynamics_kwargs['effects'] must hold effects or their to_json(), not {effect!r}")
     return {**kwargs, "effects": plain}
@@ -118,10 +123,16 @@ def constructor_names(cls: type) -> set[str]:
 def list_of_names(declared: Sequence[str]) -> tuple[str, ...]:
     """``declared=`` as a tuple.
 
-    :raises TypeError: for a single name, which would come apart into letters
+    :raises TypeError: for a single name, which would come apart into letters, and for what is no list of names
     """
     if isinstance(declared, str):
         raise TypeError(f"declared must be a list of names, not the string {declared!r}; write [{declared!r}]")
+    if isinstance(declared, Mapping):
+        raise TypeError(
+            "declared must be a list of names, not a mapping; bounds are part of a name: 'pole.length=0.1:1'"
+        )
+    if not isinstance(declared, Sequence) or not all(isinstance(name, str) for name in declared):
+        raise TypeError(f"declared must be a list of names, not {declared!r}")
     return tuple(declared)
 
 
@@ -333,12 +344,13 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
 def _warn_of_little(model: TwoWorlds, total_timesteps: int) -> None:
     """Say so where the budget ends before the dynamics are fitted, or with next to no updates."""
     if model._offline:
-        rounds = -(-total_timesteps // int(model.source_steps))
+        steps = model._steps_of_round()
+        rounds = -(-total_timesteps // steps)
         updates = rounds * max(model.gradient_steps, 1)
         if updates < FEW_UPDATES <= total_timesteps:
             warnings.warn(
-                f"total_timesteps={total_timesteps} source steps are {rounds} rounds of source_steps="
-                f"{model.source_steps} with gradient_steps={model.gradient_steps} updates each, {updates} in all; "
+                f"total_timesteps={total_timesteps} source steps are {rounds} rounds of {steps} (source_steps="
+                f"{model.source_steps}) with gradient_steps={model.gradient_steps} updates each, {updates} in all; "
                 "raise gradient_steps or total_timesteps",
                 stacklevel=4,
             )

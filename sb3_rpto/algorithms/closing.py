@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms import warm
-from sb3_rpto.algorithms.looping import FRESH, Looping
+from sb3_rpto.algorithms.looping import Looping
 from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.renewal import outdated, renew_source
 from sb3_rpto.algorithms.source import EpisodeSource
@@ -191,9 +191,16 @@ class LoopCloser:
             model.snapshots.pop("learner", None)  # of the simulator that is dropped
             renew_source(model)
             if model.updates_policy and not model._offline and model.updates_per_step:
-                learn_in_source(model, self)
-                if self.may_judge(model):
-                    self.rehearsals.go_back(model)
+                try:
+                    learn_in_source(model, self)
+                    if self.may_judge(model):
+                        self.rehearsals.go_back(model)
+                except BaseException:  # nobody is left with a policy that was not judged
+                    if self.may_judge(model) and "simulator" in model.snapshots:
+                        model.rollback("simulator")
+                    raise
+                finally:
+                    model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
             self.stale = False
 
     def may_judge(self, model: Looping) -> bool:
@@ -226,7 +233,9 @@ class LoopCloser:
             self.rehearsals.take_up_learner(model)
         try:
             while model._owed:
-                learn_for_a_step(model)
+                paid_by = max(model.num_timesteps - model._owed, 0)  # a schedule's learning rate is that of then
+                model._update_current_progress_remaining(paid_by, model._total_timesteps)
+                learn_for_a_step(model, int(model.source_steps))
                 model._owed -= 1
                 if judges and model._owed and self.rehearsals.due(model._n_updates):
                     self._judge(model)
@@ -283,8 +292,6 @@ class LoopCloser:
         late = any(effect.overrides("late") for effect in found)
         if late:  # what was seen before a step began tells nothing of one-step errors
             before = math.inf
-        if before == math.inf and new and not explains_more(report):
-            return []
         kept = dynamics.effects(), dynamics.deviations()
         declared = [effect for effect in dynamics.effects() if isinstance(effect, Declared)]
         dynamics.replace(declared, dynamics.deviations())
@@ -372,11 +379,6 @@ def deviation_of(traced: Traced) -> np.ndarray:
     return np.nan_to_num((high - low) / WIDTH, nan=np.inf)
 
 
-def explains_more(report: Report) -> bool:
-    """Whether the effects are good for anything: explained, or a smaller error of the windows than without them."""
-    return report.verdict != "unexplained" or report.adequacy_after.ratio < report.adequacy_before.ratio
-
-
 def stays_finite(dynamics: PhysicalDynamics, data: Transitions, env: VecEnv) -> bool:
     """Whether the simulator runs on from states of the target under the target's own actions.
 
@@ -404,10 +406,10 @@ def _from_resets(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
     return observations, np.array(actions)
 
 
-def learn_for_a_step(model: Looping, times: int = 1) -> int:
-    """Steps 3 (so many times), 5 and 6 of a round with one target step, but for the fit; the number of source steps."""
+def learn_for_a_step(model: Looping, source_steps: int) -> int:
+    """Steps 3 (of so many), 5 and 6 of a round with one target step, but for the fit; the number of source steps."""
     assert model._source_world is not None
-    taken = model._source_world.interact(model, times * int(model.source_steps))
+    taken = model._source_world.interact(model, source_steps)
     model.source_timesteps += taken
     model.train(model.updates_per_step, model.batch_size)
     return taken
@@ -418,7 +420,7 @@ def learn_in_source(model: Looping, loop: LoopCloser) -> None:
 
     What counts is what the best policy so far earns in rehearsals, which are as frequent as beside target steps: from
     one to the next a policy may lose most of what it earns, and win it back. Where the simulator may not judge, it is
-    what the round's own episodes earned.
+    what the round's own episodes earned. A schedule of the learning rate goes from its beginning to its end.
     """
     loop.rehearse(model)
     source = model._source_world
@@ -428,7 +430,8 @@ def learn_in_source(model: Looping, loop: LoopCloser) -> None:
         source.returns.clear()
         end = min(steps + ROUND, model.retrain_steps)
         while steps < end:
-            steps += learn_for_a_step(model, FRESH)
+            model._update_current_progress_remaining(steps, model.retrain_steps)
+            steps += learn_for_a_step(model, model.fresh_steps())
             if loop.rehearsals.due(model._n_updates):
                 loop.rehearse(model)
         # Where no episode ended there is nothing to judge by, and learning goes on.

@@ -8,8 +8,8 @@ from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.tracing import Measurements
 
-#: In a simulator that is new to the policy so many times as many source steps are taken for the same updates, which
-#: cost far more: of few steps of its own a policy learns slowly there, or loses what it knows.
+#: Source steps for each update in a simulator that is new to the policy. Updates cost far more, and of few steps of its
+#: own a policy learns slowly there, or loses what it knows.
 FRESH = 8
 
 
@@ -43,9 +43,20 @@ class Looping(Resumable):
         else:
             super().update()
 
+    def fresh_steps(self) -> int:
+        """Source steps for the updates of a target step in a simulator that is new to the policy, of all its copies."""
+        copies = int(self.source_steps)
+        return max(-(-FRESH * self.updates_per_step // copies), 1) * copies
+
     def _steps_of_round(self) -> int:
-        """With a log for a target: many where the simulator accounts for it, as the policy learns from them alone."""
-        return super()._steps_of_round() * (FRESH if self._offline and self._worlds_are_alike() else 1)
+        """With a log for a target: many where the simulator accounts for it, as the policy learns from them alone.
+
+        Before the log is traced it is taken for granted that it will.
+        """
+        awaited = self._traces_log and self.loop is not None and not self.loop.found
+        return (
+            self.fresh_steps() if self._offline and (awaited or self._worlds_are_alike()) else super()._steps_of_round()
+        )
 
     def _worlds_are_alike(self) -> bool:
         return self.loop is not None and self.loop.accounts

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 
 from sb3_rpto.algorithms.source import copied
 from sb3_rpto.algorithms.worlds import check_finite
@@ -47,6 +48,7 @@ class Rehearsals:
         #: taken so far, of the source's
         self.steps = 0
         self._phi: np.ndarray | None = None
+        self._seen_by = np.empty(0)
         self._names: list[str] = []
         self._at_update = -np.inf  # the first one as soon as the simulator accounts for the target
 
@@ -60,9 +62,10 @@ class Rehearsals:
 
     def rehearse(self, model: Looping, dynamics: PhysicalDynamics) -> None:
         """Play, and keep the policy if it is the best so far."""
-        normaliser = model.get_vec_normalize_env()  # where its statistics move, so does what the best one earns
-        if self._has_moved(dynamics) or (normaliser is not None and normaliser.training):
+        seen_by = _statistics(model)  # where they move, so does what the best one earns
+        if self._has_moved(dynamics) or not np.array_equal(seen_by, self._seen_by):
             model.snapshots.setdefault("simulator", model.snapshots["source"])
+            self._seen_by = seen_by
             self._phi, self._names, self._returns = dynamics.values.copy(), list(dynamics.names), np.empty(0)
         returns = np.empty(0)
         for episodes in (FEW, SOME, ALL):
@@ -77,6 +80,7 @@ class Rehearsals:
                 break
         self.last = float(returns.mean())
         model.logger.record("source/rehearsed", self.last)
+        model.logger.record("source/rehearsal_timesteps", self.steps, exclude="tensorboard")
         if self._leads:
             self.best, self._returns = self.last, returns
             model.take_snapshot("simulator")
@@ -161,3 +165,12 @@ class Rehearsals:
 def _mean(values: np.ndarray) -> tuple[float, float]:
     """Mean and its standard error."""
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
+
+
+def _statistics(model: Looping) -> np.ndarray:
+    """What observations are normalised by, mean and variance; empty where they are not."""
+    normaliser = model.get_vec_normalize_env()
+    if normaliser is None or not normaliser.norm_obs:
+        return np.empty(0)
+    assert isinstance(normaliser.obs_rms, RunningMeanStd)  # not of a Dict
+    return np.concatenate([normaliser.obs_rms.mean, normaliser.obs_rms.var])

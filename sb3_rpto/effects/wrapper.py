@@ -26,10 +26,18 @@ def own(effects: Sequence[Effect], model: mujoco.MjModel) -> list[Effect]:
     """The same effects for ``model``, whose nominal values declared parameters start from.
 
     :param effects: left as they are
+    :raises TypeError: no list of effects
     :raises ValueError: the model lacks an object that an effect sits on
     """
     mine: list[Effect] = []
+    if isinstance(effects, Effect):
+        raise TypeError(f"effects must be a list of effects, not one of them; write [{effects.label}]")
     for effect in effects:
+        if not isinstance(effect, Effect):
+            raise TypeError(
+                f"effects must hold effects, not {type(effect).__name__}; of a report take report.apply(env), or "
+                "[found.effect for found in report.effects]"
+            )
         if isinstance(effect, Declared):
             effect = Declared(model, effect.label, (-np.inf, np.inf)).with_values(effect.values)
         else:

@@ -205,12 +205,12 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
     :param episodes: of an evaluation
     """
     path = folder / f"{job.name}.json"
-    if path.exists():
-        return path
-    th.set_num_threads(1)
-    made_by = commit()  # a checkout may move on while this runs
     method, points, settings = METHODS[job.method]
     points = tuple(p for p in points if budget is None or p <= budget) or ((budget,) if points and budget else ())
+    if path.exists() and json.loads(path.read_text())[-1]["steps"] >= max(points, default=0):
+        return path  # else it is of a smaller budget
+    th.set_num_threads(1)
+    made_by = commit()  # a checkout may move on while this runs
     agent, data = source_agent(job.task, folder)
     target = partial(make_target, job.task, job.shift, job.target, job.sensors, job.seed)
     kwargs: dict[str, Any] = dict(settings)

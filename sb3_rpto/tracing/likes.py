@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -76,18 +76,30 @@ class Likes:
             rest = [e for e in current.effects if e not in pair]
             if len(rest) != len(current.effects) - 2:
                 continue
-            without = selector.model(rest, current.fit)
-            outside = [i for i in range(len(self.effects)) if i not in rest and self.screening.excited(i)]
-            outside = [i for i in outside if not self.effects[i].known]
-            for one, begin in selector.promising(without, outside):
+            for one, trial in self._in_place_of_two(current, pair, rest, selection):
                 selector.say(1.0, f"{self.effects[one].label} in the place of two")
-                trial = selector.model([*rest, one], begin, EXCHANGED)
                 if not selector.evidence(current, trial).clear(SEEMS):
                     current = trial
                     selection.alike[one] = [i for i in self.screening.alike(one) if i not in trial.effects]
                     break
         selection.model = current
         return selection
+
+    def _in_place_of_two(
+        self, model: Model, pair: tuple[int, int], rest: Sequence[int], selection: Selection
+    ) -> Iterator[tuple[int, Model]]:
+        """Models with one effect in the place of a pair: first those that can stand for one of the two.
+
+        With such a one the other may have become needless: its fit begins there, as one from elsewhere may have failed.
+        """
+        for e in pair:
+            for one in selection.alike.get(e, []):
+                if one not in model.effects:
+                    yield one, self.selector.anew([*rest, one], self._exchanged(model, e, one).fit, EXCHANGED)
+        outside = [i for i in range(len(self.effects)) if i not in rest and self.screening.excited(i)]
+        outside = [i for i in outside if not self.effects[i].known]
+        for one, begin in self.selector.promising(self.selector.model(rest, model.fit), outside):
+            yield one, self.selector.model([*rest, one], begin, EXCHANGED)
 
     def uniform(self, model: Model, selection: Selection) -> Model:
         """Try the kind that is kept most in the place of each odd one that it resembles: joints are built alike.

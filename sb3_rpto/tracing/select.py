@@ -214,18 +214,30 @@ class Selector:
         key = tuple(sorted(effects))
         if key in self._memory:
             return self._memory[key]
-        values = begin.values.copy()
-        for i, s in enumerate(self.simulation.slices):
-            if i not in key and not self.simulation.effects[i].known:
-                values[s] = self.simulation.null[s]
         free = self.free(key)
-        fit = self.train.fit(values, free, begin.starts, iterations, tolerance=3e-3)
+        fit = self.train.fit(self._less(begin.values, key), free, begin.starts, iterations, tolerance=3e-3)
         known = [m.fit for m in self._memory.values() if {*m.effects} < {*key} and m.fit.cost < fit.cost]
         if known:
             smaller = min(known, key=lambda f: f.cost)
             again = self.train.fit(smaller.values, free, smaller.starts, iterations, tolerance=3e-3)
             fit = min(fit, again, key=lambda f: f.cost)
         return self._remembered(key, fit)
+
+    def anew(self, effects: Sequence[int], begin: Fit, iterations: int) -> Model:
+        """As :meth:`model`, but fitted from this beginning even where another fit is remembered; the better of both."""
+        key = tuple(sorted(effects))
+        begun = self._less(begin.values, key)
+        fit = self.train.fit(begun, self.free(key), begin.starts, iterations, tolerance=3e-3)
+        known = self._memory.get(key)
+        return known if known is not None and known.fit.cost <= fit.cost else self._remembered(key, fit)
+
+    def _less(self, values: np.ndarray, key: Sequence[int]) -> np.ndarray:
+        """Parameters at which all effects but the given and the known ones have no influence."""
+        less = values.copy()
+        for i, s in enumerate(self.simulation.slices):
+            if i not in key and not self.simulation.effects[i].known:
+                less[s] = self.simulation.null[s]
+        return less
 
     def led_on(self, model: Model) -> Model:
         """A model that errs more than need be, out of kinks that may hold its fit; exact data can be met exactly."""

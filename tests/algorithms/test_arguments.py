@@ -14,7 +14,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms import arguments
-from sb3_rpto.effects import LIBRARY
+from sb3_rpto.effects import LIBRARY, declare
 
 VALUES = {
     "dynamics": "ensemble",
@@ -146,6 +146,25 @@ def test_a_single_declared_name_does_not_come_apart_into_letters():
         small(RPTO, env, target, dynamics="physical", dynamics_kwargs={}, declared="pole.length")
 
 
+@pytest.mark.parametrize(
+    ("declared", "said"),
+    [
+        ({"pole.length": (0.1, 1.0)}, "not a mapping; bounds are part of a name"),
+        ([1], r"not \[1\]"),
+        (None, "not None"),
+    ],
+)
+def test_declared_names_of_another_type_are_refused(declared, said):
+    with pytest.raises(TypeError, match=f"declared must be a list of names, {said}"):
+        physical(declared=declared)
+
+
+def test_declared_numbers_among_the_known_effects_are_refused():
+    (length,) = declare(gym.make("InvertedDoublePendulum-v5").unwrapped.model, ["pole.length"])
+    with pytest.raises(ValueError, match=r"holds declared numbers, pole.length: .* name those in declared="):
+        physical(dynamics_kwargs={"effects": [length]})
+
+
 def physical(**kwargs):
     env, target = (gym.make("InvertedDoublePendulum-v5") for _ in range(2))
     return small(RPTO, env, target, dynamics="physical", **kwargs)
@@ -249,7 +268,8 @@ def test_a_budget_that_ends_before_the_first_fit_is_told():
 def test_next_to_no_updates_offline_are_told():
     model = small(RPTO, source_steps=400, gradient_steps=5)
     model._offline = True
-    with pytest.warns(UserWarning, match="3 rounds of source_steps=400 with gradient_steps=5 updates each, 15 in all"):
+    told = r"3 rounds of 400 \(source_steps=400\) with gradient_steps=5 updates each, 15 in all"
+    with pytest.warns(UserWarning, match=told):
         arguments._warn_of_little(model, 1_200)
 
 

@@ -528,6 +528,7 @@ def test_learning_in_the_corrected_simulator_that_was_interrupted_is_counted_and
 
     def interrupted(steps: int, batch_size: int) -> None:
         if made.loop is not None and made.loop.stale:
+            spoil(made)
             raise KeyboardInterrupt
         train(steps, batch_size)
 
@@ -537,6 +538,9 @@ def test_learning_in_the_corrected_simulator_that_was_interrupted_is_counted_and
     assert made.loop is not None
     assert made.loop.found
     assert made.loop.stale
+    left = weights(made)
+    made.rollback("simulator")
+    np.testing.assert_array_equal(left, weights(made))  # not what was learned and judged by nobody
     before = made.source_timesteps
     monkeypatch.undo()
     monkeypatch.setattr(renewal, "FILL", 25)
@@ -694,6 +698,7 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
 ) -> None:
     monkeypatch.setattr(closing, "ROUND", 160)
     updates: list[int] = []
+    remaining: list[float] = []
     # What does not count earns ever more.
     source, judge = Scripted([float(i) for i in range(9)] if judges else earns), Judge(earns, judges)
     made = SimpleNamespace(
@@ -706,12 +711,34 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
         source_timesteps=5,
         verbose=0,
         train=lambda n, batch_size: updates.append(n),
+        fresh_steps=lambda: 160,
+        _update_current_progress_remaining=lambda taken, most: remaining.append(1 - taken / most),
     )
     closing.learn_in_source(made, judge)  # type: ignore[arg-type]
+    assert remaining == [1 - 160 * i / 1_280 for i in range(rounds)]  # for a schedule of the learning rate
     assert updates == [30] * rounds
     assert judge.asked == 1 + rounds + 1
     assert source.asked == [8 * 20] * rounds  # in the source each call draws gSDE's noise anew
     assert made.source_timesteps == 5 + 8 * 20 * rounds
+
+
+@pytest.mark.parametrize(("updates", "copies", "steps"), [(20, 20, 160), (20, 160, 160), (1, 20, 20), (3, 10, 30)])
+def test_eight_steps_for_each_update_are_taken_by_whole_copies(updates: int, copies: int, steps: int) -> None:
+    assert filled([], 1, gradient_steps=updates, source_steps=copies).fresh_steps() == steps
+
+
+def test_a_schedule_of_the_learning_rate_does_not_end_what_target_steps_paid_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = forgetful()
+    assert made.loop is not None
+    made._total_timesteps, made.num_timesteps, made._owed = 10, 10, 4
+    left: list[float] = []
+    monkeypatch.setattr(made, "train", lambda steps, batch_size: left.append(made._current_progress_remaining))
+    monkeypatch.setattr(made.loop, "accounts", False)
+    made._source_world = Scripted([])  # type: ignore[assignment]
+    made.loop._learn_what_is_owed(made)
+    assert left == pytest.approx([0.4, 0.3, 0.2, 0.1])
 
 
 # --- rehearsals -------------------------------------------------------------------------------------------------------
@@ -905,7 +932,7 @@ def test_a_judged_policy_acts_where_learning_was_interrupted_and_nothing_is_lear
     monkeypatch.setattr(made, "train", train)
     begun: list[np.ndarray] = []
     learn = closing.learn_for_a_step
-    monkeypatch.setattr(closing, "learn_for_a_step", lambda m: begun.append(weights(m)) or learn(m))  # type: ignore[func-returns-value]
+    monkeypatch.setattr(closing, "learn_for_a_step", lambda m, n: begun.append(weights(m)) or learn(m, n))  # type: ignore[func-returns-value]
     made.learn(40, reset_num_timesteps=False)
     assert (made._n_updates - updates, made._owed) == (80, 0)
     assert not np.array_equal(begun[0], acting)  # the one that was interrupted
@@ -962,19 +989,19 @@ def test_the_critic_sees_no_estimated_states_where_the_simulator_accounts_for_a_
     assert [float(batch.rewards.mean()) for batch in made.critic_batches(3, 16)] == [share] * 3
 
 
-@pytest.mark.parametrize(("accounts", "times"), [(True, 8), (False, 1)])
+@pytest.mark.parametrize(("accounts", "updates"), [(True, 10), (False, 20)])
 def test_many_steps_are_taken_for_each_update_where_the_simulator_accounts_for_a_log(
-    accounts: bool, times: int
+    accounts: bool, updates: int
 ) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, source_steps=5).learn(40, source_timesteps=0)
     assert made.loop is not None
     made.loop.accounts = accounts
-    taken, updates = made.source_timesteps - made.loop.rehearsals.steps, made._n_updates
+    taken, before = made.source_timesteps - made.loop.rehearsals.steps, made._n_updates
     made.learn(100, reset_num_timesteps=False)
     assert made.num_timesteps == 140  # the budget counts each of them
     assert made.source_timesteps - made.loop.rehearsals.steps - taken == 100
-    assert made._n_updates - updates == 100 // 5 // times + bool(100 // 5 % times)
+    assert made._n_updates - before == updates
 
 
 def test_after_a_log_the_best_policy_is_left_and_the_last_one_goes_on_learning(monkeypatch: pytest.MonkeyPatch) -> None:

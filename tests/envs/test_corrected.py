@@ -148,6 +148,14 @@ def test_the_memory_of_commands_is_part_of_the_state():
     assert env.envs[0].get_wrapper_attr("_memory") == [{}]
 
 
+def test_what_is_no_list_of_effects_is_refused():
+    friction = CoulombFriction("slider")
+    with pytest.raises(TypeError, match=r"write \[coulomb_friction\(slider\)\]"):
+        apply_effects(gym.make(POLE), friction)
+    with pytest.raises(TypeError, match=r"hold effects, not str; of a report take report.apply"):
+        apply_effects(gym.make(POLE), ["coulomb_friction"])
+
+
 def test_bad_environments_are_named():
     with pytest.raises(TypeError, match="make_vec_env"):
         apply_effects(make_vec_env(POLE), [])

@@ -48,6 +48,20 @@ def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
     assert Likes(s, found).simplest(rich, Selection(rich)).effects == (0,)
 
 
+def test_one_takes_the_place_of_two_where_its_first_fit_had_failed() -> None:
+    """Beside one that can stand for one of the two the other is needless, which a bad fit of it alone would hide."""
+    effects: list[Effect] = [CoulombFriction("hinge"), ViscousFriction("hinge"), StribeckFriction("hinge")]
+    planted = [CoulombFriction("hinge", level=0.08)]
+    train, unseen = (problem(effects, recorded(planted, noise=5e-3, seed=seed), noise=5e-3) for seed in (2, 102))
+    s = Selector(train, unseen, THRESHOLD, lambda share, what: None)
+    nothing = train.score(train.null)
+    both = s.model([1, 2], nothing, 12)
+    s._remembered((0,), nothing)  # as of a search that had ended elsewhere
+    found = Likes(s, screen(train, nothing)).merge(Selection(both, alike={1: [0]}))
+    assert found.model.effects == (0,)
+    assert found.model.fit.values[0] == pytest.approx(0.08, rel=0.05)
+
+
 #: three links, of which a motor drives the first
 LINK = """<body pos="0 0 -.3"><joint name="{0}" axis="0 -1 0"/>
 <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="{1}"/>"""
