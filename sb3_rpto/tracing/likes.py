@@ -88,14 +88,13 @@ class Likes:
     def _in_place_of_two(
         self, model: Model, pair: tuple[int, int], rest: Sequence[int], selection: Selection
     ) -> Iterator[tuple[int, Model]]:
-        """Models with one effect in the place of a pair: first those that can stand for one of the two.
+        """Models with one effect in the place of a pair: first what can stand for one of the two, the simple before.
 
         With such a one the other may have become needless: its fit begins there, as one from elsewhere may have failed.
         """
-        for e in pair:
-            for one in selection.alike.get(e, []):
-                if one not in model.effects:
-                    yield one, self.selector.anew([*rest, one], self._exchanged(model, e, one).fit, EXCHANGED)
+        stands = [(e, one) for e in pair for one in selection.alike.get(e, []) if one not in model.effects]
+        for e, one in sorted(stands, key=lambda stand: len(self.effects[stand[1]].parameters)):
+            yield one, self.selector.anew([*rest, one], self._exchanged(model, e, one).fit, EXCHANGED)
         outside = [i for i in range(len(self.effects)) if i not in rest and self.screening.excited(i)]
         outside = [i for i in outside if not self.effects[i].known]
         for one, begin in self.selector.promising(self.selector.model(rest, model.fit), outside):
