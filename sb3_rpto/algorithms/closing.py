@@ -292,6 +292,9 @@ class LoopCloser:
         late = any(effect.overrides("late") for effect in found)
         if late:  # what was seen before a step began tells nothing of one-step errors
             before = math.inf
+        nearer = report.verdict != "unexplained" or report.adequacy_after.ratio < report.adequacy_before.ratio
+        if before == math.inf and new and not nearer:
+            return []
         kept = dynamics.effects(), dynamics.deviations()
         declared = [effect for effect in dynamics.effects() if isinstance(effect, Declared)]
         dynamics.replace(declared, dynamics.deviations())

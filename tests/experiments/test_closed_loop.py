@@ -129,10 +129,24 @@ def test_a_run_says_which_commit_made_it(tmp_path: Path, monkeypatch: pytest.Mon
     assert (row["commit"], row["return"], row["target"]) == ("0123abc", 1.0, 1)
 
 
+def test_a_run_of_a_smaller_budget_is_not_taken_for_a_longer_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = study.Job("double-pendulum", "none", 0, "SAC-warm", 0)
+    path = tmp_path / f"{job.name}.json"
+    path.write_text(json.dumps([{"steps": 0}, {"steps": 250}]))
+    monkeypatch.setattr(study, "source_agent", lambda *_: ("agent", None))
+    monkeypatch.setattr(study, "transfer", lambda *_, every, **__: [{"steps": steps} for steps in (0, *every)])
+    study.run(job, tmp_path, 250)
+    assert len(json.loads(path.read_text())) == 2
+    study.run(job, tmp_path, 500)
+    assert [row["steps"] for row in json.loads(path.read_text())] == [0, 250, 500]
+
+
 def test_finished_runs_are_not_repeated_and_are_collected(tmp_path: Path) -> None:
     job = study.Job("double-pendulum", "none", 0, "zero-shot", 0)
     path = tmp_path / f"{job.name}.json"
-    path.write_text(json.dumps([{"task": "double-pendulum", "return": 1.0}]))
+    path.write_text(json.dumps([{"task": "double-pendulum", "return": 1.0, "steps": 0}]))
     (tmp_path / "oracle_double-pendulum_none_0.json").write_text(json.dumps({"return": 2.0}))
     assert study.run(job, tmp_path) == path
     assert study.oracle("double-pendulum", "none", 0, tmp_path) == 2.0
