@@ -124,7 +124,7 @@ def by_sac(source: Path, report: Report, steps: int, folder: Path, seed: int) ->
 
 
 def by_rpto(source: Path, data: Measurements, kinds: list[str] | None, steps: int, seed: int) -> tuple[RPTO, Report]:
-    """The log in place of a target: RPTO traces by itself, and learns in the simulator (alone, if it explains the log)."""
+    """The log in place of a target: RPTO traces it, and learns in the simulator (alone, if that explains the log)."""
     model = RPTO.from_source(
         source,
         gym.make(TASK),
