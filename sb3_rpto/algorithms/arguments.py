@@ -136,6 +136,30 @@ def list_of_names(declared: Sequence[str]) -> tuple[str, ...]:
     return tuple(declared)
 
 
+def check_names(cls: type, passed: Collection[str]) -> None:
+    """Refuse an argument that a class's constructor does not take.
+
+    :param passed: names of the arguments
+    :raises TypeError: saying the near names
+    """
+    known = constructor_names(cls)
+    for name in passed:
+        if name not in known:
+            raise TypeError(f"{cls.__name__} has no argument {name!r}; {near(name, sorted(known - {'self'}))}")
+
+
+def check_learning_rate(learning_rate: Any) -> None:
+    """Refuse what stands in the learning rate's place by mistake.
+
+    :raises TypeError: it is neither a number nor a schedule
+    """
+    if not (_is_number(learning_rate) or callable(learning_rate)):
+        raise TypeError(
+            f"learning_rate must be a number or a schedule, not {type(learning_rate).__name__}; an environment of the "
+            "target is passed by name, target_env="
+        )
+
+
 def check_applicable(algorithm: str, updates_dynamics: bool, passed: Collection[str]) -> None:
     """Refuse arguments that the algorithm has no use for.
 
@@ -354,17 +378,17 @@ def _warn_of_little(model: TwoWorlds, total_timesteps: int) -> None:
                 "raise gradient_steps or total_timesteps",
                 stacklevel=4,
             )
-    elif model.updates_dynamics and total_timesteps + model.replay_buffer.target.size() < model.model_train_freq:
-        warnings.warn(
-            f"total_timesteps={total_timesteps} ends before the first fit of the dynamics, after "
-            f"{model.model_train_freq} target steps; raise it, or lower model_train_freq",
-            stacklevel=4,
-        )
     elif model.loop is not None and _first_trace(model, model.loop) > total_timesteps:
         warnings.warn(
             f"total_timesteps={total_timesteps} ends before the closed loop's first trace, for which it waits "
             f"{_first_trace(model, model.loop)} target steps, until a fit (model_train_freq={model.model_train_freq}); "
             "raise it",
+            stacklevel=4,
+        )
+    elif model.updates_dynamics and total_timesteps + model.replay_buffer.target.size() < model.model_train_freq:
+        warnings.warn(
+            f"total_timesteps={total_timesteps} ends before the first fit of the dynamics, after "
+            f"{model.model_train_freq} target steps; raise it, or lower model_train_freq",
             stacklevel=4,
         )
 

@@ -82,7 +82,11 @@ class TransferAlgorithm(Looping):
     _rollout_began_at: int
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
-        """Remember which arguments the user passed: a preset fills in only the others."""
+        """Remember which arguments the user passed: a preset fills in only the others.
+
+        :raises TypeError: for an argument that does not exist
+        """
+        arguments.check_names(cls, kwargs)
         self = super().__new__(cls)
         positional = list(inspect.signature(TransferAlgorithm.__init__).parameters)[1:]
         self._passed = frozenset(positional[: len(args)]) | frozenset(kwargs)
@@ -134,6 +138,7 @@ class TransferAlgorithm(Looping):
         source_steps: int | Literal["auto"] = "auto",
         model_train_freq: int = 250,
     ) -> None:
+        arguments.check_learning_rate(learning_rate)
         if isinstance(env, str):
             env = gym.make(env)
         if env is not None:  # SB3's load() builds the object before it has an env

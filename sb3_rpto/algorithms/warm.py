@@ -51,6 +51,7 @@ def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
 
     :raises TypeError: for a model of another kind
     :raises ValueError: for a zip that SAC cannot load
+    :raises FileNotFoundError: there is none
     """
     if isinstance(source_model, SAC):
         return source_model
@@ -64,7 +65,11 @@ def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"source_model={str(source_model)!r} is not the zip of a SAC ({error}); a model of this package goes on "
-            "with its own class's load()"
+            "with its own class's load(), and what that loads may be a source_model"
+        ) from error
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"source_model={str(source_model)!r}: there is no such file; pass a SAC's zip"
         ) from error
 
 

@@ -106,7 +106,9 @@ class PhysicalDynamics(Dynamics):
         self.model, self.recover, self.frame_skip = model, recover, frame_skip
         self.max_step, self.max_steps, self.randomise = max_step, max_steps, randomise
         self.threads = threads
-        self.observation_noise = None if observation_noise is None else noise_of_each(observation_noise, recover)
+        self.observation_noise = (
+            None if observation_noise is None else noise_of_each(observation_noise, recover, "observation_noise")
+        )
         self._twin: CorrectedEnv | None = None
         self._unseen: tuple[str, ...] = ()
         self._entangled: tuple[str, ...] = ()

@@ -61,7 +61,10 @@ def given(model: mujoco.MjModel, declared: Sequence[str], known: Sequence[Effect
     :raises ValueError: a name or an effect that the model does not have, or has twice; a known effect that does nothing
     :raises TypeError: ``known`` holds something else
     """
-    declare(model, declared)  # what is wrong with it is said first
+    try:  # what is wrong with it is said first
+        declare(model, declared)
+    except ValueError as error:
+        raise ValueError(f"declared: {error}") from None
     if isinstance(known, Effect):
         raise TypeError(f"known must be a list of effects; write [{known.label}]")
     for effect in known:

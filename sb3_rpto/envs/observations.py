@@ -96,10 +96,11 @@ def register_state_map(env: str | type[gym.Env], make: Callable[[gym.Env], Recov
     _registered[env] = make
 
 
-def noise_of_each(noise: float | Sequence[float] | np.ndarray, recover: StateMap) -> np.ndarray:
+def noise_of_each(noise: float | Sequence[float] | np.ndarray, recover: StateMap, name: str = "noise") -> np.ndarray:
     """Standard deviation of each observation's noise, (width,), from one for each or for all.
 
     :param recover: the observations' map
+    :param name: of the argument, for the messages
     :raises ValueError: of another shape, no numbers, negative or not finite, or no noise at all; observations that do
         not hold all velocities, without which a noisy sample is no state
     """
@@ -110,15 +111,16 @@ def noise_of_each(noise: float | Sequence[float] | np.ndarray, recover: StateMap
     fits = given.shape in ((), (recover.width,)) and not isinstance(noise, bool)
     if not fits or not (np.isfinite(given).all() and (given >= 0).all() and given.any()):
         raise ValueError(
-            f"the noise of the observations is {noise!r}; give a standard deviation above 0, or one for each of the "
-            f"{recover.width} observations, in their units; leave it out for observations without noise"
+            f"{name} is {noise!r}; give the standard deviation of the observations' noise, above 0, or one for each of "
+            f"the {recover.width}, in their units; leave it out for observations without noise"
         )
     with np.errstate(all="ignore"):
         shown = recover(np.zeros((1, recover.width))).known_qvel[0]
     if not shown.all():
         raise ValueError(
-            f"a noise of the observations was given, but those of {recover.env_name} do not hold the velocities of "
-            f"all joints ({int((~shown).sum())} of {len(shown)} are missing): leave it out, or observe them"
+            f"{name}: the observations of {recover.env_name} do not hold the velocities of all joints "
+            f"({int((~shown).sum())} of {len(shown)} are missing), so noisy ones are no states: leave it out, or "
+            "observe them"
         )
     return np.broadcast_to(given, (recover.width,)).copy()
 

@@ -83,7 +83,7 @@ def read_columns(names: Iterable[str], file: str) -> Columns:
         if prefix in found and rest:
             found[prefix].append(rest)
         elif name not in PLAIN:
-            raise ValueError(f"{file}: unknown column {name!r}; {_near(name)}; drop what the file format does not know")
+            raise ValueError(f"{file}: unknown column {name!r}; {_near(name)}; rename it, or drop what is not needed")
     if "time" not in names:
         raise ValueError(f"{file}: no column 'time'; add the time of each sample in seconds")
     if not found["qpos"]:

@@ -265,6 +265,40 @@ def test_a_budget_that_ends_before_the_first_fit_is_told():
         small(RPTO, model_train_freq=50).learn(20, source_timesteps=40)
 
 
+def test_a_budget_that_ends_before_the_first_trace_is_told_before_that_of_the_fit():
+    model = physical(close_loop=["spring"], declared=["hinge.damping"])
+    with pytest.warns(UserWarning, match="ends before the closed loop's first trace, for which it waits 2.. target"):
+        arguments._warn_of_little(model, 20)
+
+
+@pytest.mark.parametrize(
+    ("passed", "said"),
+    [
+        ({"closed_loop": True}, "RPTO has no argument 'closed_loop'; did you mean 'close_loop'"),
+        ({"target": "x"}, "RPTO has no argument 'target'; did you mean .*'target_env'"),
+        ({"learning_rate": pendulum()}, "learning_rate must be a number or a schedule, not .*target_env="),
+    ],
+)
+def test_arguments_that_do_not_exist_or_stand_in_the_wrong_place_are_told(passed, said):
+    with pytest.raises(TypeError, match=said):
+        RPTO("MlpPolicy", pendulum(), **passed)
+
+
+def test_a_subclass_may_take_arguments_of_its_own():
+    class Mine(RPO):
+        def __init__(self, *args, colour="red", **kwargs):
+            super().__init__(*args, **kwargs)
+
+    assert small(Mine, pendulum(), pendulum(12.0), colour="blue").updates_policy
+    with pytest.raises(TypeError, match="Mine has no argument 'color'; did you mean 'colour'"):
+        small(Mine, pendulum(), pendulum(12.0), color="blue")
+
+
+def test_a_source_model_that_is_not_there_is_named():
+    with pytest.raises(FileNotFoundError, match=r"source_model='nowhere\.zip': there is no such file"):
+        RPO.from_source("nowhere.zip", pendulum())
+
+
 def test_next_to_no_updates_offline_are_told():
     model = small(RPTO, source_steps=400, gradient_steps=5)
     model._offline = True
