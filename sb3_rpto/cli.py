@@ -10,22 +10,17 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
-from sb3_rpto.commands import enjoy, plot, train, transfer
+from sb3_rpto.commands import adapt, enjoy, plot, recordings, train, transfer
 from sb3_rpto.commands.options import check_file
 from sb3_rpto.version import __version__
-
-if TYPE_CHECKING:
-    from sb3_rpto.tracing import Measurements
 
 #: Exit codes: bad input, and interrupted by the user.
 BAD_INPUT, INTERRUPTED = 2, 130
 #: What users can cause is said in one line; an error of ours keeps its traceback, unless it is of these kinds, too,
 #: and nobody asked for it.
 USER_ERRORS = (ValueError, TypeError, OSError, ImportError, NotImplementedError)
-#: Readers of recordings by the suffix of their files.
-FORMATS = {"csv": "from_csv", "parquet": "from_parquet", "npz": "from_npz"}
 #: Modules with ``main(arguments) -> exit code`` behind ``sb3-rpto benchmark NAME``.
 BENCHMARKS = {
     "tracing": "sb3_rpto.experiments.tracing_benchmark",
@@ -55,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=f"sb3-rpto {__version__}")
     parser.add_argument("--traceback", action="store_true", help="where an error arose, in place of one line")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (train.add, transfer.add, enjoy.add, plot.add, _add_trace, _add_benchmark):
+    for add in (train.add, transfer.add, adapt.add, enjoy.add, plot.add, _add_trace, _add_benchmark):
         add(commands)
     traceback = False
     try:
@@ -107,24 +102,13 @@ def _add_trace(commands: Commands) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("model", metavar="MODEL", help="MJCF file, or gymnasium id (Reacher-v5, package:name/Task-v0)")
-    parser.add_argument("files", metavar="FILES", nargs="+", help="recordings: .csv, .csv.gz, .parquet or .npz")
+    recordings.add(parser)
     parser.add_argument("--out", metavar="DIR", required=True, type=Path, help="folder for the report and the model")
-    parser.add_argument(
-        "--declare",
-        metavar="A,B",
-        type=_names,
-        action="extend",
-        default=[],
-        help="parameters that may be fitted: hinge.damping, pole.mass, '*.damping', arm.mass=0.2:0.9; repeatable",
-    )
     parser.add_argument(
         "--known",
         metavar="FILE",
         type=Path,
         help="effects that the machine is known to have: the effects.json of an earlier trace of the same MODEL",
-    )
-    parser.add_argument(
-        "--candidates", metavar="K1,K2", type=_names, help="kinds of effects to look for (default: all in the library)"
     )
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the split and the resampling (default: 0)")
     parser.add_argument(
@@ -149,13 +133,8 @@ def _add_trace(commands: Commands) -> None:
         help="the recordings are of MODEL's own simulator, in its steps in time (default: found out; being told saves "
         "a second search)",
     )
-    parser.add_argument("--format", choices=sorted(FORMATS), help="of the recordings (default: by their suffix)")
     parser.add_argument("--quiet", action="store_true", help="no progress; print the verdict alone")
     parser.set_defaults(run=_trace)
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def _trace(parsed: argparse.Namespace) -> int:
@@ -167,8 +146,7 @@ def _trace(parsed: argparse.Namespace) -> int:
     figures.require()
     if parsed.horizon is not None and not parsed.horizon > 0:
         raise ValueError(f"--horizon is {parsed.horizon:g}; give a time in s above 0")
-    if parsed.candidates == []:
-        raise ValueError("--candidates is empty; name kinds of effects, or leave it out to look for all")
+    recordings.check_candidates(parsed.candidates)
     if parsed.calibrate < 0:
         raise ValueError(f"--calibrate is {parsed.calibrate}; give a number of data sets, or 0 for none")
     if parsed.threads < 0:
@@ -184,7 +162,7 @@ def _trace(parsed: argparse.Namespace) -> int:
         )
     with tempfile.TemporaryDirectory() as trial:
         save_corrected(trial, model, [])
-    data = _recordings(parsed.files, parsed.format)
+    data = recordings.read(parsed.files, parsed.format)
     known = [] if parsed.known is None else read_effects(parsed.known, load_model(model)[1])
     parsed.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=parsed.out):
@@ -237,25 +215,6 @@ def _model(name: str) -> Any:
         return gym.make(name)
     except (gym.error.Error, ModuleNotFoundError) as error:
         raise ValueError(f"MODEL {name!r} is neither a file nor a gymnasium environment: {error}") from error
-
-
-def _recordings(files: Sequence[str], form: str | None) -> Measurements:
-    """Read files of one format."""
-    from sb3_rpto.tracing import Measurements
-
-    found = {form} if form else {_format_of(file) for file in files}
-    if len(found) > 1:
-        raise ValueError(f"FILES are of several formats ({', '.join(sorted(map(str, found)))}); convert them to one")
-    return getattr(Measurements, FORMATS[str(found.pop())])(files)
-
-
-def _format_of(file: str) -> str:
-    if Path(file).is_dir():
-        raise ValueError(f"{file} is a folder; name its files, such as {Path(file) / '*.csv'}")
-    suffix = Path(file.removesuffix(".gz")).suffix.removeprefix(".").lower()
-    if suffix not in FORMATS:
-        raise ValueError(f"{file}: recordings are .csv, .csv.gz, .parquet or .npz; name another suffix's by --format")
-    return suffix
 
 
 @contextlib.contextmanager

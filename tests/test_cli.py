@@ -11,6 +11,7 @@ import mujoco
 import pytest
 
 from sb3_rpto import __version__, cli
+from sb3_rpto.commands import recordings
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.experiments.planting import generate
 from sb3_rpto.tracing import Measurements, Report, trace, wording
@@ -214,7 +215,7 @@ def test_interrupt_gives_130(files: Path, capsys: pytest.CaptureFixture[str], mo
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "_recordings", interrupted)
+    monkeypatch.setattr(recordings, "read", interrupted)
     assert run(files) == 130
     assert capsys.readouterr().err == "sb3-rpto: interrupted\n"
 

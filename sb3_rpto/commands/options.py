@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def add_common(parser: argparse.ArgumentParser, of_target: str = "") -> None:
-    """Options of commands that train: how long, how often it is judged, the seed, the settings.
+    """Options of commands that train and evaluate: how long, how often it is judged, and the settings.
 
     :param parser: of the command
     :param of_target: what to call the steps
@@ -27,6 +27,14 @@ def add_common(parser: argparse.ArgumentParser, of_target: str = "") -> None:
     parser.add_argument("--steps", metavar="N", type=int, help=f"{of_target}steps (default: those of the task)")
     parser.add_argument("--every", metavar="N", type=int, help="steps between evaluations (default: a tenth of all)")
     parser.add_argument("--episodes", metavar="N", type=int, default=10, help="of an evaluation (default: 10)")
+    add_settings(parser)
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Options of all commands that learn: the seed, the settings, the device.
+
+    :param parser: of the command
+    """
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="(default: 0)")
     parser.add_argument(
         "--set",

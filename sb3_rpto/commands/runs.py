@@ -19,6 +19,8 @@ from sb3_rpto.algorithms.checkpoint import write_atomically
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.experiments.run import LearningCurve, MakeEnv
 
+#: In a checkpoint: the class of its model, and the rows until then.
+CURVE = "curve.json"
 PACKAGES = ("sb3-rpto", "stable-baselines3", "gymnasium", "torch", "numpy")
 
 
@@ -179,7 +181,7 @@ class SavedCurve(LearningCurve):
 
         :param folder: of the checkpoint
         """
-        state = json.loads((folder / "curve.json").read_text(encoding="utf-8"))
+        state = json.loads((folder / CURVE).read_text(encoding="utf-8"))
         self.rows, self.source_steps, self._due = state["rows"], state["source_steps"], state["due"]
         self._spent, self._updates_at_start = state["spent"], state["updates_at_start"]
         self._resumed = True
@@ -209,7 +211,7 @@ class SavedCurve(LearningCurve):
             return
         self._unsaved = False
         state = {
-            "class": f"{type(self.model).__module__}:{type(self.model).__qualname__}",
+            "class": class_name(self.model),
             "rows": self.rows,
             "source_steps": self.source_steps,
             "due": self._due,
@@ -221,9 +223,14 @@ class SavedCurve(LearningCurve):
             self.model.save(folder / "model.zip")
             if getattr(self.model, "replay_buffer", None) is not None:
                 self.model.save_replay_buffer(folder / "replay_buffer.pkl")  # type: ignore[attr-defined]
-            (folder / "curve.json").write_text(json.dumps(state), encoding="utf-8")
+            (folder / CURVE).write_text(json.dumps(state), encoding="utf-8")
 
         self.run.save_checkpoint(self.num_timesteps, write)
+
+
+def class_name(model: BaseAlgorithm) -> str:
+    """By which :func:`algorithm_of` finds a model's class again."""
+    return f"{type(model).__module__}:{type(model).__qualname__}"
 
 
 def algorithm_of(folder: Path) -> type[BaseAlgorithm]:
@@ -231,7 +238,7 @@ def algorithm_of(folder: Path) -> type[BaseAlgorithm]:
 
     :param folder: of the checkpoint
     """
-    state = json.loads((folder / "curve.json").read_text(encoding="utf-8"))
+    state = json.loads((folder / CURVE).read_text(encoding="utf-8"))
     module, _, name = state["class"].partition(":")
     return getattr(importlib.import_module(module), name)
 

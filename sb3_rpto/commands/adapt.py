@@ -1,0 +1,107 @@
+"""``sb3-rpto adapt``: from a robot's log to a policy that was trained in the corrected simulator."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from sb3_rpto.commands import options, recordings
+
+DESCRIPTION = """\
+Go from a robot's log to a policy for it, without a step on the robot: say from the
+log what the simulator lacks, correct it, and let the policy learn on there (RPTO).
+
+The same command goes on where it was killed: from its last checkpoint.
+"""
+
+EXAMPLE = """\
+example:
+  sb3-rpto adapt source.zip InvertedDoublePendulum-v5 'log/*.csv' --declare pole.length --out runs/robot
+
+writes into DIR report.html to read, report.json, the corrected simulator (model.xml, effects.json), model.zip
+and result.json. Recordings: docs/measurements.md. The whole way: docs/robot-log-to-policy.md
+"""
+
+#: What the command gives itself.
+GIVEN = frozenset(
+    {"self", "policy", "env", "target_env", "target_data", "dynamics", "declared", "close_loop", "seed", "device"}
+)
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser's."""
+    parser = commands.add_parser(
+        "adapt",
+        help="from a robot's log to a policy for it",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("source_model", metavar="ZIP", help="SAC that was trained in the simulator")
+    parser.add_argument("env", metavar="ENV", help="id of the simulator: HalfCheetah-v5, package:name/Task-v0")
+    recordings.add(parser)
+    parser.add_argument("--out", metavar="DIR", required=True, type=Path, help="folder of the run; it resumes there")
+    parser.add_argument(
+        "--steps", metavar="N", type=int, default=64_000, help="in the simulator, 8 for each update (default: 64,000)"
+    )
+    options.add_settings(parser)
+    parser.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace) -> int:
+    """Trace and learn, or go on with it."""
+    from sb3_rpto import RPTO
+    from sb3_rpto.algorithms.arguments import constructor_names
+    from sb3_rpto.algorithms.checkpoint import write_atomically
+    from sb3_rpto.commands.progress import Progress, earnings, read_rows
+    from sb3_rpto.commands.runs import RunFolder, beside, load_checkpoint
+    from sb3_rpto.tracing import figures
+
+    figures.require()
+    options.check_positive(parsed, "steps")
+    options.check_file(parsed.source_model, "ZIP")
+    recordings.check_candidates(parsed.candidates)
+    settings = dict(parsed.set)
+    options.check_names(settings, constructor_names(RPTO) - GIVEN)
+    world = options.world(parsed.env, "ENV")
+    data = recordings.read(parsed.files, parsed.format)
+    config = {
+        "command": "adapt",
+        "env": world.name,
+        "source_model": beside(parsed.out, parsed.source_model),
+        "files": [beside(parsed.out, file) for file in parsed.files],
+        "declare": parsed.declare,
+        "candidates": parsed.candidates,
+        "steps": parsed.steps,
+        "seed": parsed.seed,
+        "settings": settings,
+    }
+    folder = RunFolder.open(parsed.out, config)
+    if folder.result.exists():
+        print(f"adapted already: {folder.model}")
+        return 0
+    checkpoint = folder.newest_checkpoint()
+    model: Any
+    if checkpoint is None:
+        model = RPTO.from_source(
+            parsed.source_model,
+            world.make(),
+            target_data=data,
+            dynamics="physical",
+            declared=parsed.declare,
+            close_loop=parsed.candidates or True,
+            seed=parsed.seed,
+            device=parsed.device,
+            **settings,
+        )
+        rows = []
+    else:
+        model = load_checkpoint(checkpoint, world.make(), device=parsed.device)
+        rows = read_rows(checkpoint)
+    progress = Progress(folder, parsed.steps, rows, parsed.quiet)
+    model.learn(parsed.steps - model.num_timesteps, callback=progress, reset_num_timesteps=checkpoint is None)
+    write_atomically(folder.model, model.save)
+    folder.finish(progress.rows)
+    print(f"{earnings(model.loop)}; written: {folder.model}")
+    return 0

@@ -1,0 +1,85 @@
+"""What a run on a log says and leaves: the report as soon as there is one, checkpoints, what the policy earns."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_rpto.commands.runs import CURVE, RunFolder, class_name
+
+if TYPE_CHECKING:
+    from sb3_rpto.algorithms.closing import LoopCloser
+
+#: Rows of a run; a checkpoint with each but the last.
+COUNT = 8
+
+
+class Progress(BaseCallback):
+    """Writes the report before the policy learns, and now and then a checkpoint with a row of what the policy earns.
+
+    It is no learning curve: there is no target, and the policy is judged in the corrected simulator, where that may.
+
+    :param run: whose folder
+    :param total: source steps of the run
+    :param rows: of the checkpoint that the run goes on from: steps, updates, seconds, simulated_return
+    :param quiet: say the verdict alone
+    """
+
+    def __init__(self, run: RunFolder, total: int, rows: list[dict[str, Any]], quiet: bool) -> None:
+        super().__init__()
+        self.run, self.total, self.rows, self.quiet = run, total, rows, quiet
+        self._before = rows[-1]["seconds"] if rows else 0.0
+        self._since = time.perf_counter()
+
+    def _on_training_start(self) -> None:
+        loop = self.model.loop  # type: ignore[attr-defined]
+        if loop.reports:  # else it goes on from a checkpoint, and the report is there
+            loop.reports[0].save(self.run.path)
+            verdict = loop.reports[0].verdict
+            report = self.run.path / "report.html"
+            print(verdict if self.quiet else f"{loop.reports[0]}\n\nwritten: {report}", flush=True)
+
+    def _on_step(self) -> bool:
+        taken = sum(self.num_timesteps >= self.total * n // COUNT for n in range(1, COUNT))
+        if taken > len(self.rows):
+            self._add_row()
+            self.run.save_checkpoint(self.num_timesteps, self._write)
+        return True
+
+    def _on_training_end(self) -> None:
+        self._add_row()
+
+    def _add_row(self) -> None:
+        model: Any = self.model
+        self.rows.append(
+            {
+                "steps": self.num_timesteps,
+                "updates": model._n_updates,
+                "seconds": round(self._before + time.perf_counter() - self._since, 2),
+                "simulated_return": float(model.loop.rehearsals.best) if model.loop.accounts else None,
+            }
+        )
+        if not self.quiet:
+            print(f"{self.num_timesteps:>9,} of {self.total:,} steps: {earnings(model.loop)}", flush=True)
+
+    def _write(self, folder: Path) -> None:
+        self.model.save(folder / "model.zip")
+        self.model.save_replay_buffer(folder / "replay_buffer.pkl")  # type: ignore[attr-defined]
+        state = {"class": class_name(self.model), "rows": self.rows}
+        (folder / CURVE).write_text(json.dumps(state), encoding="utf-8")
+
+
+def read_rows(checkpoint: Path) -> list[dict[str, Any]]:
+    """The rows of a checkpoint."""
+    return json.loads((checkpoint / CURVE).read_text(encoding="utf-8"))["rows"]
+
+
+def earnings(loop: LoopCloser) -> str:
+    """What the best policy so far earns, where anything tells."""
+    if not loop.accounts:
+        return "the simulator does not account for the log, so nothing tells what the policy is worth"
+    return f"return {loop.rehearsals.best:.1f} in the corrected simulator"

@@ -1,0 +1,69 @@
+"""Files that a machine's logger left, as commands take them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sb3_rpto.tracing import Measurements
+
+#: Readers of recordings by the suffix of their files.
+FORMATS = {"csv": "from_csv", "parquet": "from_parquet", "npz": "from_npz"}
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add what is told of recordings, and of what to look for in them, to a command's parser."""
+    parser.add_argument("files", metavar="FILES", nargs="+", help="recordings: .csv, .csv.gz, .parquet or .npz")
+    parser.add_argument("--format", choices=sorted(FORMATS), help="of the recordings (default: by their suffix)")
+    parser.add_argument(
+        "--declare",
+        metavar="A,B",
+        type=names,
+        action="extend",
+        default=[],
+        help="parameters that may be fitted: hinge.damping, pole.mass, '*.damping', arm.mass=0.2:0.9; repeatable",
+    )
+    parser.add_argument(
+        "--candidates", metavar="K1,K2", type=names, help="kinds of effects to look for (default: all in the library)"
+    )
+
+
+def names(text: str) -> list[str]:
+    """Names that commas part."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def check_candidates(candidates: list[str] | None) -> None:
+    """Refuse an empty list.
+
+    :raises ValueError: with the remedy
+    """
+    if candidates == []:
+        raise ValueError("--candidates is empty; name kinds of effects, or leave it out to look for all")
+
+
+def read(files: Sequence[str], form: str | None) -> Measurements:
+    """Read files of one format.
+
+    :param files: paths or patterns
+    :param form: the format; None: by their suffix
+    :raises ValueError: of several formats, or an unknown one
+    """
+    from sb3_rpto.tracing import Measurements
+
+    found = {form} if form else {_format_of(file) for file in files}
+    if len(found) > 1:
+        raise ValueError(f"FILES are of several formats ({', '.join(sorted(map(str, found)))}); convert them to one")
+    return getattr(Measurements, FORMATS[str(found.pop())])(files)
+
+
+def _format_of(file: str) -> str:
+    if Path(file).is_dir():
+        raise ValueError(f"{file} is a folder; name its files, such as {Path(file) / '*.csv'}")
+    suffix = Path(file.removesuffix(".gz")).suffix.removeprefix(".").lower()
+    if suffix not in FORMATS:
+        raise ValueError(f"{file}: recordings are .csv, .csv.gz, .parquet or .npz; name another suffix's by --format")
+    return suffix

@@ -1,0 +1,110 @@
+"""The command adapt: from a log to a report, a corrected simulator and a policy; how it resumes, what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+import torch as th
+from stable_baselines3 import SAC
+
+from sb3_rpto import RPTO, cli
+from sb3_rpto.commands.progress import Progress
+from sb3_rpto.effects import LIBRARY
+from sb3_rpto.effects.carry import load_corrected
+from sb3_rpto.envs.corrected import apply_effects
+
+ENV = "InvertedPendulum-v5"
+FEW = ["--steps", "320", "--set", "source_steps=4", "--set", "gradient_steps=2", "--device", "cpu", "--quiet"]
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An agent that knows nothing, and the log of a machine whose hinge is pulled to one side."""
+    folder = tmp_path_factory.mktemp("given")
+    SAC("MlpPolicy", gym.make(ENV), policy_kwargs={"net_arch": [16]}, seed=0, device="cpu").save(folder / "agent.zip")
+    machine = gym.make(ENV, frame_skip=1)
+    machine.unwrapped.model.opt.timestep = 0.005  # a log is finer than the commands, as that of a robot
+    robot = apply_effects(machine, [LIBRARY["torque_offset"]("hinge", offset=0.5)])
+    rng, rows = np.random.default_rng(0), []
+    for attempt in range(8):
+        robot.reset(seed=attempt)
+        state = robot.unwrapped.data
+        commands = rng.uniform(-1, 1, (160 // 8, 1)).repeat(8, axis=0)
+        for step, command in enumerate(commands):
+            shown = state.qpos + 1e-4 * rng.standard_normal(2)
+            rows.append([attempt, step * 0.005, *shown, *command])
+            robot.step(command)
+    columns = ["episode", "time", "qpos.slider", "qpos.hinge", "ctrl.slide"]
+    pd.DataFrame(rows, columns=columns).to_csv(folder / "log.csv", index=False)
+    return folder
+
+
+def adapt(given: Path, out: Path, *options: str, agent: str = "agent.zip", env: str = ENV, log: str = "log.csv") -> int:
+    found = ["--candidates", "torque_offset", *FEW, *options]
+    return cli.main(["adapt", str(given / agent), env, str(given / log), "--out", str(out), *found])
+
+
+def test_a_log_becomes_a_report_a_simulator_and_a_policy(given: Path, tmp_path: Path, capsys) -> None:
+    assert adapt(given, tmp_path) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("explained\n")
+    assert said.endswith(f"in the corrected simulator; written: {tmp_path / 'model.zip'}\n")
+    names = {"config.json", "effects.json", "model.xml", "model.zip", "report.html", "report.json", "result.json"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    (pull,) = load_corrected(tmp_path).effects
+    assert pull.label == "torque_offset(hinge)"
+    assert pull.values == pytest.approx([0.5], rel=0.02)
+    rows = json.loads((tmp_path / "result.json").read_text())["rows"]
+    assert [row["steps"] for row in rows] == [48, 80, 128, 160, 208, 240, 288, 320]  # at the ends of rounds of 16
+    assert rows[-1]["simulated_return"] > 0
+    assert RPTO.load(tmp_path / "model.zip", device="cpu").num_timesteps == 320
+
+    assert adapt(given, tmp_path) == 0
+    assert capsys.readouterr().out == f"adapted already: {tmp_path / 'model.zip'}\n"
+    assert adapt(given, tmp_path, "--seed", "1") == 2
+    assert "holds a run with seed=0" in capsys.readouterr().err
+
+
+def test_a_killed_run_goes_on_as_if_it_had_not_been(given: Path, tmp_path: Path, monkeypatch) -> None:
+    assert adapt(given, tmp_path / "whole") == 0
+    add = Progress._add_row
+
+    def interrupted(self: Progress) -> None:
+        if len(self.rows) == 3:
+            raise KeyboardInterrupt
+        add(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Progress, "_add_row", interrupted)
+        assert adapt(given, tmp_path / "killed") == 130
+    assert (tmp_path / "killed" / "report.html").exists()
+    assert adapt(given, tmp_path / "killed") == 0
+    one, other = (RPTO.load(tmp_path / name / "model.zip", device="cpu").policy for name in ("whole", "killed"))
+    assert all(th.equal(a, b) for a, b in zip(one.parameters(), other.parameters(), strict=True))
+    seen = [json.loads((tmp_path / name / "result.json").read_text())["rows"] for name in ("whole", "killed")]
+    whole, killed = ([{**row, "seconds": 0} for row in rows] for rows in seen)
+    assert whole == killed
+
+
+@pytest.mark.parametrize(
+    ("passed", "options", "said"),
+    [
+        ({"agent": "absent.zip"}, [], "ZIP: there is no file"),
+        ({"env": "InvertedPendulum-v55"}, [], "did you mean 'InvertedPendulum-v5'"),
+        ({"log": "absent.csv"}, [], "no file matches"),
+        ({}, ["--candidates", ""], "--candidates is empty"),
+        ({}, ["--candidates", "torque_ofset"], "did you mean 'torque_offset'"),
+        ({}, ["--declare", "hinge.dampng"], "declared: 'hinge.dampng'"),
+        ({}, ["--set", "target_env=x"], "--set target_env: there is no such argument"),
+        ({}, ["--steps", "0"], "--steps is 0"),
+    ],
+)
+def test_bad_input_is_told_before_the_trace(given: Path, tmp_path: Path, capsys, passed, options, said) -> None:
+    assert adapt(given, tmp_path / "out", *options, **passed) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
