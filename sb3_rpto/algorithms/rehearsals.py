@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from sb3_rpto.algorithms.looping import Looping
 
 #: Episodes of a rehearsal, always from the same starts. After a few a policy that is clearly behind the best one plays
-#: no further, nor does after some more one that is not ahead, or clearly so. A small lead needs all of them: of many
-#: policies the luckiest would be taken otherwise. Their most steps where the task has no end.
+#: no further, nor does after some more one that is not ahead. All of them show who leads: of many policies the luckiest
+#: would be taken otherwise, or one that falls now and then. Their most steps where the task has no end.
 FEW, SOME, ALL, LONGEST, SEED = 5, 25, 100, 1_000, 30_000
-#: A lead is none by less than this share of what the best policy earns (root mean square of its episodes), and clear by
-#: more than :data:`LOST` of it and so many standard errors.
+#: A lead is none by less than this share of what the best policy earns (root mean square of its episodes). A policy is
+#: clearly behind by more than :data:`LOST` of it and so many standard errors.
 GAIN, SURE = 1e-3, 2.0
 #: Updates of the policy between two rehearsals.
 EVERY = 2_000
@@ -74,9 +74,11 @@ class Rehearsals:
             returns = np.append(returns, self._play(model, dynamics, range(len(returns), episodes)))
             self._lead, self._error = _mean(returns - self._returns[:episodes])
             self._leads = self._lead > GAIN * self._size()
-            clear = abs(self._lead) > LOST * self._size() + SURE * self._error
-            # A few do not show that a policy falls now and then, so that no lead is clear by them.
-            if (clear and not self._leads) if episodes == FEW else (clear or not self._leads):
+            lost = LOST * self._size()
+            if episodes == FEW and self._lead < -lost - SURE * self._error:
+                break
+            # Where the best one falls in episodes that are yet to come, this one may show that it does not.
+            if episodes == SOME and not self._leads and returns.mean() <= self.best + lost:
                 break
         self.last = float(returns.mean())
         model.logger.record("source/rehearsed", self.last)

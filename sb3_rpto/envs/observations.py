@@ -111,8 +111,8 @@ def noise_of_each(noise: float | Sequence[float] | np.ndarray, recover: StateMap
     fits = given.shape in ((), (recover.width,)) and not isinstance(noise, bool)
     if not fits or not (np.isfinite(given).all() and (given >= 0).all() and given.any()):
         raise ValueError(
-            f"{name} is {noise!r}; give the standard deviation of the observations' noise, above 0, or one for each of "
-            f"the {recover.width}, in their units; leave it out for observations without noise"
+            f"{name} is {noise!r}; give a standard deviation above 0, or one for each of the {recover.width} "
+            "observations, in their units; leave it out for observations without noise"
         )
     with np.errstate(all="ignore"):
         shown = recover(np.zeros((1, recover.width))).known_qvel[0]

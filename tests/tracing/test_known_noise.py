@@ -111,7 +111,7 @@ def test_a_speed_that_noise_may_have_brought_below_its_bound_is_not_known() -> N
 
 @pytest.mark.parametrize("wrong", [-1e-3, 0.0, np.nan, True, [1e-3] * 4, [[1.0], [1.0, 2.0]], "much"])
 def test_a_noise_that_is_none_is_refused(wrong: object) -> None:
-    with pytest.raises(ValueError, match=r"noise is .*; give the standard deviation .*, above 0"):
+    with pytest.raises(ValueError, match=r"noise is .*; give a standard deviation above 0"):
         Measurements.from_replay(seen([], 4), gym.make(TASK), noise=wrong)  # type: ignore[arg-type]
 
 
