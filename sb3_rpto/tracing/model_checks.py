@@ -194,9 +194,9 @@ def _sampling(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
         found.append(Finding("stiff model", "the model", message))
     if step > 1.01 * SLOW and not data.exact:
         message = (
-            f"the median step is {step:.4g} s; effects faster than that, such as a short delay, leave no trace, and what "
-            "the motion does between samples passes for an error of the model: log faster, or, of a simulator's own "
-            "steps, pass its transitions (Measurements.from_replay)"
+            f"the median step is {step:.4g} s; effects faster than that, such as a short delay, leave no trace, and "
+            "what the motion does between samples passes for an error of the model: log faster, or, of a "
+            "simulator's own steps, pass its transitions (Measurements.from_replay)"
         )
         found.append(Finding("slow sampling", f"{ALL}, time", message))
     return found
