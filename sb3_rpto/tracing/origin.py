@@ -13,6 +13,7 @@ from sb3_rpto.effects import Effect, Simulation
 from sb3_rpto.effects.library import given
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.model_checks import SLOW
 from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.windows import cut, discretised, noise_levels
 
@@ -27,6 +28,16 @@ CLEARLY, SOMEWHAT = 0.5, 0.8
 NOISELESS = 0.03
 
 Origin: TypeAlias = Literal["machine", "simulated", "exact"]
+
+
+def may_be_exact(data: Measurements) -> bool:
+    """Whether noise cannot be told from motion, so that recordings that seem noisy may be a simulator's, without any.
+
+    Where commands change from one slow sample to the next the motion between them is not smooth. All velocities are to
+    be known, as predictions would begin at the samples themselves.
+    """
+    step = np.median(np.concatenate([np.diff(episode.time) for episode in data.episodes]))
+    return not (data.whole_states or data.columns.missing or data.unobserved) and bool(step >= SLOW)
 
 
 def origin(

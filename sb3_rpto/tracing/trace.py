@@ -34,7 +34,7 @@ from sb3_rpto.tracing.loss import Loss
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.missing import missing_forces
 from sb3_rpto.tracing.model_checks import doubts
-from sb3_rpto.tracing.origin import origin
+from sb3_rpto.tracing.origin import may_be_exact, origin
 from sb3_rpto.tracing.prepare import Progress, SetUp, prepare
 from sb3_rpto.tracing.report import Candidate, Report, StandIn, Traced
 from sb3_rpto.tracing.residuals import learnable_share, summary
@@ -96,22 +96,29 @@ def trace(
     _check_arguments(data, seed, candidates, horizon, calibrate, threads)
     say = _steady(progress)
 
-    def prepared(simulated: bool) -> SetUp:
+    def prepared(data: Measurements, simulated: bool) -> SetUp:
         return prepare(model, data, declared, seed, candidates, horizon, threads, known, simulated)
 
     def search(on: SetUp) -> Found:
         at, finer = partial(on.selectors, say=say), partial(on.finer, say=say)
         return find(at, finer, on.length, on.longer, seed, calibrate)
 
-    set_up = prepared(simulated)
+    set_up = prepared(data, simulated)
     found = search(set_up)
     again = _of_own_steps(set_up, found, declared, threads)
     if again is not None:
-        set_up = prepared(True)
+        set_up = prepared(data, True)
         found = search(set_up)
         set_up.findings.append(again)
-    first, explained = found, judge(found.before, found.after, bool(found.selection.model.effects)) in SETTLED
-    zeros = zeros_by_run(set_up, found, explained, say, seed)
+    if not _explains(found) and may_be_exact(data):
+        exact = prepared(replace(data, exact=True), simulated)
+        then = search(exact)
+        if _explains(then):
+            set_up, found = exact, then
+            message = "from the model's own steps in time, without noise, as shows with what was found: searched again"
+            set_up.findings.append(Finding("simulated", "fitted runs", message))
+    first = found
+    zeros = zeros_by_run(set_up, found, _explains(found), say, seed)
     if zeros is not None:
         without = homed(set_up, zeros)
         without, refined, then = settled(without, zeros, search(without), say, seed)
@@ -221,13 +228,16 @@ def trace(
     )
 
 
+def _explains(found: Found) -> bool:
+    return judge(found.before, found.after, bool(found.selection.model.effects)) in SETTLED
+
+
 def _of_own_steps(set_up: SetUp, found: Found, declared: Sequence[str], threads: int) -> Finding | None:
     """Whether recordings that were taken for a machine's turn out to be the model's own, now that something is found.
 
     What is missing errs as much in one kind of steps as in another; with it in the model they can be told apart.
     """
-    named = bool(found.selection.model.effects)
-    if judge(found.before, found.after, named) in SETTLED or not named:
+    if _explains(found) or not found.selection.model.effects:
         return None
     simulation, values = found.on.fine.simulation, found.selection.model.fit.values
     known = [i for i, e in enumerate(simulation.effects) if e.known and not isinstance(e, Declared)]

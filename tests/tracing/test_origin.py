@@ -2,13 +2,16 @@
 
 import importlib
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from simulated import compiled, recorded
 
+from sb3_rpto.effects import LIBRARY
 from sb3_rpto.effects.friction import CoulombFriction
-from sb3_rpto.tracing import trace
-from sb3_rpto.tracing.origin import origin
+from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.tracing import Measurements, trace
+from sb3_rpto.tracing.origin import may_be_exact, origin
 
 #: semi-implicit steps of 5 ms err by far more than a tenth of a milliradian
 OWN = """<mujoco><option timestep="0.005"/><worldbody><body name="pole">
@@ -56,3 +59,37 @@ def test_what_is_told_to_be_simulated_is_not_asked(monkeypatch: pytest.MonkeyPat
     set_up = module.prepare(OWN, recorded([], compiled(OWN)), DECLARED, 0, [], 0.4, 1, simulated=True)
     assert set_up.fitted.simulated
     assert "simulated" not in [f.kind for f in set_up.findings]
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.5])
+@pytest.mark.parametrize("velocities", [True, False])
+def test_a_simulator_that_was_logged_as_slowly_as_it_is_commanded_is_exact(offset: float, velocities: bool) -> None:
+    """What the motion does between such samples looks like noise."""
+    env = gym.make("InvertedPendulum-v5")
+    robot = apply_effects(env, [LIBRARY["torque_offset"]("hinge", offset=offset)] if offset else [])
+    rng, rows = np.random.default_rng(0), []
+    for run in range(12):
+        robot.reset(seed=run)
+        state = robot.unwrapped.data
+        for step, command in enumerate(rng.uniform(-1, 1, (16, 1))):
+            rows.append([run, 0.04 * step, *state.qpos, *command, *state.qvel])
+            robot.step(command)
+    names = ["episode", "time", "qpos.slider", "qpos.hinge", "ctrl.slide", "qvel.slider", "qvel.hinge"]
+    table = dict(zip(names[: 7 if velocities else 5], np.array(rows).T))
+    report = trace(env, Measurements.from_tables({"log": table}), candidates=["torque_offset", "coulomb_friction"])
+    if not velocities:
+        assert report.verdict == "unexplained"
+        return
+    assert report.verdict == ("explained" if offset else "complete")
+    assert [traced.label for traced in report.effects] == (["torque_offset(hinge)"] if offset else [])
+    assert all(traced.effect.values == pytest.approx([offset], rel=1e-4) for traced in report.effects)
+    assert ["searched again" in f.message for f in report.findings if f.kind == "simulated"] == [True]
+
+
+def test_a_machine_that_was_logged_slowly_and_lacks_what_is_not_looked_for_is_none() -> None:
+    fine = compiled(OWN.replace('timestep="0.005"', 'timestep="0.001" integrator="RK4"'))
+    data = recorded([CoulombFriction("hinge", level=0.2)], fine, rate=40)
+    assert may_be_exact(data)
+    report = trace(OWN, data, DECLARED, candidates=["torque_offset"], threads=1)
+    assert not report.data.exact
+    assert report.verdict not in ("complete", "explained")
