@@ -14,7 +14,7 @@ from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.looping import Looping
 from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.renewal import outdated, renew_source
-from sb3_rpto.algorithms.source import EpisodeSource
+from sb3_rpto.algorithms.rounds import Rounds, learn_for_a_step
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Declared, from_json
@@ -46,10 +46,6 @@ NOISY_WINDOW, SHORT_STRETCHES = 6, 0.25
 ENOUGH = 400
 #: What is found is kept when the one-step error falls below this share of the best without it.
 WORTH = 0.9
-#: With D_source made anew the policy learns in the corrected simulator what it can for nothing, before the next target
-#: step: in rounds of so many source steps, until so many in a row earned no more than the best one and this share of
-#: it, or ``retrain_steps`` are taken. A task that is solved earns a trifle more for ever.
-ROUND, PATIENCE, RISE = 80_000, 2, 1e-3
 #: Width of a normal distribution's 95 % interval, in standard deviations.
 WIDTH = 3.92
 #: A corrected simulator must stay finite for so many steps from states of the target, as the uncorrected one does.
@@ -75,6 +71,8 @@ class LoopCloser:
         self._untraced = False
         #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
         self.stale = False
+        #: of learning there, as long as they last
+        self.rounds: Rounds | None = None
         #: whether a trace made phi that knows better than one-step errors: of noisy transitions, or of late sensors
         self.keeps_phi = False
         #: whether the simulator accounts for the target by the last trace, so that it may judge policies
@@ -91,7 +89,7 @@ class LoopCloser:
 
     def forget_target(self) -> None:
         """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""
-        self._traced_at, self._error, self.rehearsals = None, math.inf, Rehearsals()
+        self._traced_at, self._error, self.rehearsals, self.rounds = None, math.inf, Rehearsals(), None
         self.accounts = self.keeps_phi = False
 
     def due(self, model: Looping, dynamics: PhysicalDynamics) -> bool:
@@ -185,23 +183,28 @@ class LoopCloser:
     def renew(self, model: Looping) -> None:
         """Drop what is :attr:`stale`, if anything is, and learn anew; a budget of source steps learns by itself.
 
-        Where that is interrupted it is done when the run goes on.
+        Where that is interrupted it goes on with the run.
         """
-        if self.stale:
+        if not self.stale:
+            return
+        if self.rounds is None:
             model.snapshots.pop("learner", None)  # of the simulator that is dropped
             renew_source(model)
-            if model.updates_policy and not model._offline and model.updates_per_step:
-                try:
-                    learn_in_source(model, self)
-                    if self.may_judge(model):
-                        self.rehearsals.go_back(model)
-                except BaseException:  # nobody is left with a policy that was not judged
-                    if self.may_judge(model) and "simulator" in model.snapshots:
-                        model.rollback("simulator")
-                    raise
-                finally:
-                    model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
-            self.stale = False
+            self.rounds = Rounds()
+        if model.updates_policy and not model._offline and model.updates_per_step:
+            judges = self.may_judge(model)
+            self.rehearsals.take_up_learner(model)
+            try:
+                self.rounds.learn(model, self)
+                if judges:
+                    self.rehearsals.go_back(model)
+            except BaseException:
+                if judges:
+                    self.rehearsals.set_aside(model)  # nobody is left with a policy that was not judged
+                raise
+            finally:
+                model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
+        self.stale, self.rounds = False, None
 
     def may_judge(self, model: Looping) -> bool:
         """Whether rehearsals say anything: the policy learns, and the simulator accounts for the target."""
@@ -407,43 +410,3 @@ def _from_resets(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:
     copy.action_space.seed(0)
     actions = [[copy.action_space.sample() for _ in range(TRIAL_STEPS)] for _ in range(TRIAL_STATES)]
     return observations, np.array(actions)
-
-
-def learn_for_a_step(model: Looping, source_steps: int) -> int:
-    """Steps 3 (of so many), 5 and 6 of a round with one target step, but for the fit; the number of source steps."""
-    assert model._source_world is not None
-    taken = model._source_world.interact(model, source_steps)
-    model.source_timesteps += taken
-    model.train(model.updates_per_step, model.batch_size)
-    return taken
-
-
-def learn_in_source(model: Looping, loop: LoopCloser) -> None:
-    """Learn in the present simulator by rounds while that earns more; the target waits meanwhile.
-
-    What counts is what the best policy so far earns in rehearsals, which are as frequent as beside target steps: from
-    one to the next a policy may lose most of what it earns, and win it back. Where the simulator may not judge, it is
-    what the round's own episodes earned. A schedule of the learning rate goes from its beginning to its end.
-    """
-    loop.rehearse(model)
-    source = model._source_world
-    assert isinstance(source, EpisodeSource)
-    bar, idle, steps = -math.inf, 0, 0
-    while steps < model.retrain_steps and idle < PATIENCE:
-        source.returns.clear()
-        end = min(steps + ROUND, model.retrain_steps)
-        while steps < end:
-            model._update_current_progress_remaining(steps, model.retrain_steps)
-            steps += learn_for_a_step(model, model.fresh_steps())
-            if loop.rehearsals.due(model._n_updates):
-                loop.rehearse(model)
-        # Where no episode ended there is nothing to judge by, and learning goes on.
-        earned = float(np.mean(source.returns)) if source.returns else math.inf
-        if loop.may_judge(model):
-            earned = loop.rehearsals.best
-        if model.verbose:
-            print(f"learning in the corrected simulator: {steps} source steps, return {earned:.5g}")
-        idle = 0 if earned > bar else idle + 1
-        bar = earned + RISE * abs(earned) if bar < earned < math.inf else bar
-    if loop.rehearsals.is_behind(model):
-        loop.rehearse(model)

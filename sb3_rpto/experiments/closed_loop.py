@@ -23,6 +23,7 @@ from sb3_rpto.effects import LIBRARY, Declared, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments import sources
 from sb3_rpto.experiments.provenance import commit
+from sb3_rpto.experiments.randomised import randomised_agent
 from sb3_rpto.experiments.report import iqm_interval
 from sb3_rpto.experiments.run import transfer
 from sb3_rpto.tracing.report import write_atomically
@@ -83,6 +84,8 @@ TASKS = {
 SPEEDS = {"double-pendulum": slice(5, 8), "hopper": slice(5, 11), "cheetah": slice(8, 17), "walker": slice(8, 17)}
 SHORT, LONG = (250, 500, 1_000, 2_000), (250, 500, 1_000, 2_000, 5_000, 10_000, 20_000)
 ORACLE_STEPS = 100_000
+#: Declared numbers are off by at most this share, which a randomised source is told.
+SPREAD = 0.2
 PHYSICAL = {"dynamics": "physical"}
 METHODS: dict[str, tuple[str, tuple[int, ...], dict[str, Any]]] = {
     "zero-shot": ("zero-shot", (), {}),
@@ -92,6 +95,8 @@ METHODS: dict[str, tuple[str, tuple[int, ...], dict[str, Any]]] = {
     # The closed loop without its library: what learning on in a fitted, incomplete simulator is worth.
     "RPTO-physical, declared alone": ("rpto", SHORT, {**PHYSICAL, "close_loop": []}),
     "RPTO-physical, closed loop": ("rpto", SHORT, {**PHYSICAL, "close_loop": True}),
+    # Before its first target step it is what domain randomisation makes of the source's policy.
+    "randomised, SAC-warm": ("sac-warm", SHORT, {"gradient_steps": 1}),
 }
 
 
@@ -141,7 +146,9 @@ def shifted(task: str, shift: str, target: int) -> list[Effect]:
     env = gym.make(made.env_id)
     model = env.unwrapped.model  # type: ignore[attr-defined]
     rng = np.random.default_rng([target, *made.env_id.encode()])
-    effects: list[Effect] = [d.with_values(d.values * rng.uniform(0.8, 1.2, 1)) for d in declare(model, made.declared)]
+    effects: list[Effect] = [
+        d.with_values(d.values * rng.uniform(1 - SPREAD, 1 + SPREAD, 1)) for d in declare(model, made.declared)
+    ]
     kind, size, places = made.lacks
     if shift == "undeclared":
         for place in places:
@@ -212,6 +219,9 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
     th.set_num_threads(1)
     made_by = commit()  # a checkout may move on while this runs
     agent, data = source_agent(job.task, folder)
+    before: dict[str, float] = {}
+    if job.method.startswith("randomised"):
+        agent, before = _randomised(job, agent, folder)
     target = partial(make_target, job.task, job.shift, job.target, job.sensors, job.seed)
     kwargs: dict[str, Any] = dict(settings)
     if method == "rpto":
@@ -234,8 +244,16 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
         read=partial(_read, job.task, truth),
         **kwargs,
     )
+    rows = [{**row, **{name: row[name] + spent for name, spent in before.items()}} for row in rows]
     write_atomically(path, json.dumps([{**row, **asdict(job), "commit": made_by} for row in rows], indent=1) + "\n")
     return path
+
+
+def _randomised(job: Job, agent: str, folder: Path) -> tuple[str, dict[str, float]]:
+    """The policy of randomised sources that all targets of a task and a seed share, and what it cost."""
+    path, declared = folder / f"randomised_{job.task}_{job.seed}.zip", TASKS[job.task].declared
+    cost = randomised_agent(agent, partial(make_source, job.task), declared, SPREAD, job.seed, path)
+    return str(path), cost
 
 
 @cache

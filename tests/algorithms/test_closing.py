@@ -21,10 +21,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPTO, RTO
-from sb3_rpto.algorithms import arguments, closing, renewal
+from sb3_rpto.algorithms import arguments, closing, renewal, rounds
 from sb3_rpto.algorithms.closing import LoopCloser, stays_finite
 from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.renewal import outdated, renew_source
+from sb3_rpto.algorithms.rounds import Rounds
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
@@ -110,7 +111,7 @@ def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPat
 
 def test_an_empty_list_traces_the_declared_numbers_alone(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     began = []
-    monkeypatch.setattr(closing, "learn_in_source", lambda made, *_: began.append(made.num_timesteps))
+    monkeypatch.setattr(Rounds, "learn", lambda self, made, loop: began.append(made.num_timesteps))
     made = model(friction(), close_loop=[])
     with pytest.warns(UserWarning, match="unexplained"):
         made.learn(90, source_timesteps=100)
@@ -520,33 +521,42 @@ def test_a_small_memory_is_traced_when_it_is_full(soon: None) -> None:
     assert made.loop.due(made, dynamics(made))
 
 
-def test_learning_in_the_corrected_simulator_that_was_interrupted_is_counted_and_done_again(
+def test_learning_in_the_corrected_simulator_goes_on_where_it_was_interrupted(
     soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = model(friction()).learn(60, source_timesteps=100)
-    train = made.train
+    made = model(friction(), retrain_steps=400).learn(60, source_timesteps=100)
+    train, left = made.train, iter(range(5))
 
     def interrupted(steps: int, batch_size: int) -> None:
-        if made.loop is not None and made.loop.stale:
-            spoil(made)
+        if made.loop is not None and made.loop.stale and next(left, None) is None:
             raise KeyboardInterrupt
         train(steps, batch_size)
 
     monkeypatch.setattr(made, "train", interrupted)
     with pytest.raises(KeyboardInterrupt):
         made.learn(40, reset_num_timesteps=False)
-    assert made.loop is not None
-    assert made.loop.found
-    assert made.loop.stale
-    left = weights(made)
+    loop = made.loop
+    assert loop is not None
+    assert loop.found
+    assert loop.stale
+    assert loop.rounds is not None
+    done = loop.rounds.steps
+    assert done == 5 * made.fresh_steps()
+    acting, learner = weights(made), made.snapshots["learner"]
     made.rollback("simulator")
-    np.testing.assert_array_equal(left, weights(made))  # not what was learned and judged by nobody
-    before = made.source_timesteps
-    monkeypatch.undo()
-    monkeypatch.setattr(renewal, "FILL", 25)
+    np.testing.assert_array_equal(acting, weights(made))  # not what was learned and judged by nobody
+    made.snapshots["learner"] = learner
+    before, begun = made.source_timesteps, list[np.ndarray]()
+    monkeypatch.setattr(made, "train", lambda *_: begun.append(weights(made)) if loop.stale else None)  # type: ignore[func-returns-value]
+    monkeypatch.setattr(loop, "rehearse", lambda made: None)
     made.learn(1, reset_num_timesteps=False)
-    assert not made.loop.stale
-    assert made.source_timesteps >= before + 25 + 25
+    assert (loop.stale, loop.rounds) == (False, None)
+    learned = made.fresh_steps() * len(begun)
+    assert learned == 400 - done
+    assert made.source_timesteps - before >= learned
+    made.snapshots["learner"] = learner
+    made.rollback("learner")
+    np.testing.assert_array_equal(begun[0], weights(made))
 
 
 def test_encoder_zeros_that_differ_by_run_are_taken_off_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -573,7 +583,7 @@ def test_a_budget_of_source_steps_is_not_exceeded_by_the_loop(soon: None, monkey
     made = model([], target_data=recorded)
     assert made.loop is not None
     monkeypatch.setattr(made.loop, "_trace", lambda *_: explanation(friction()))
-    monkeypatch.setattr(closing, "learn_in_source", lambda *_: pytest.fail("learns beyond the budget"))
+    monkeypatch.setattr(Rounds, "learn", lambda *_: pytest.fail("learns beyond the budget"))
     made.learn(200, source_timesteps=0)
     assert "coulomb_friction(slider).level" in dynamics(made).names
 
@@ -686,7 +696,7 @@ GAINS = [
 
 
 @pytest.mark.parametrize(
-    ("earns", "rounds", "judges"),
+    ("earns", "lasts", "judges"),
     [
         *((*gain, False) for gain in GAINS),
         *((*gain, True) for gain in GAINS),
@@ -694,9 +704,9 @@ GAINS = [
     ],
 )
 def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
-    earns: list[float], rounds: int, judges: bool, monkeypatch: pytest.MonkeyPatch
+    earns: list[float], lasts: int, judges: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(closing, "ROUND", 160)
+    monkeypatch.setattr(rounds, "ROUND", 160)
     updates: list[int] = []
     remaining: list[float] = []
     # What does not count earns ever more.
@@ -714,12 +724,12 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
         fresh_steps=lambda: 160,
         _update_current_progress_remaining=lambda taken, most: remaining.append(1 - taken / most),
     )
-    closing.learn_in_source(made, judge)  # type: ignore[arg-type]
-    assert remaining == [1 - 160 * i / 1_280 for i in range(rounds)]  # for a schedule of the learning rate
-    assert updates == [30] * rounds
-    assert judge.asked == 1 + rounds + 1
-    assert source.asked == [8 * 20] * rounds  # in the source each call draws gSDE's noise anew
-    assert made.source_timesteps == 5 + 8 * 20 * rounds
+    Rounds().learn(made, judge)  # type: ignore[arg-type]
+    assert remaining == [1 - 160 * i / 1_280 for i in range(lasts)]  # for a schedule of the learning rate
+    assert updates == [30] * lasts
+    assert judge.asked == 1 + lasts + 1
+    assert source.asked == [8 * 20] * lasts  # in the source each call draws gSDE's noise anew
+    assert made.source_timesteps == 5 + 8 * 20 * lasts
 
 
 @pytest.mark.parametrize(("updates", "copies", "steps"), [(20, 20, 160), (20, 160, 160), (1, 20, 20), (3, 10, 30)])
@@ -1220,7 +1230,7 @@ def test_a_policy_that_stays_is_not_sent_to_learn_in_the_corrected_simulator(
     soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = filled(friction(), cls=RTO)
-    monkeypatch.setattr(closing, "learn_in_source", lambda *_: pytest.fail("RTO does not move the policy"))
+    monkeypatch.setattr(Rounds, "learn", lambda *_: pytest.fail("RTO does not move the policy"))
     assert made.loop is not None
     made.loop.close(made, dynamics(made))
     assert "coulomb_friction(slider).level" in dynamics(made).names
