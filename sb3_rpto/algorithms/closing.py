@@ -179,6 +179,8 @@ class LoopCloser:
             if model._owed or self.rehearsals.is_behind(model):
                 self._learn_what_is_owed(model)
             self.rehearsals.leave_best(model)
+            if model.verbose:
+                print(f"the policy that acts, the best so far, earns {self.rehearsals.best:.5g} in the simulator")
 
     def renew(self, model: Looping) -> None:
         """Drop what is :attr:`stale`, if anything is, and learn anew; a budget of source steps learns by itself.
@@ -258,6 +260,8 @@ class LoopCloser:
         self, model: Looping, dynamics: PhysicalDynamics, measured: Measurements, horizon: float | None
     ) -> Report:
         assert model.env is not None
+        if model.verbose:
+            print("tracing what the simulator lacks, which takes a minute or several")
         report = trace(
             single_env(model.env),
             measured,
@@ -359,12 +363,13 @@ def _say(model: Looping, report: Report, added: list[str], data: str, before: fl
         print(f"traced on {data}: {report.verdict}; {', '.join(added) or 'nothing'} added")
     if report.verdict == "unexplained":
         known = model.measured is not None or model.dynamics_kwargs.get("observation_noise") is not None
+        steps = "".join(f". {f.message}" for f in report.findings if f.kind == "time step")
         noise = "" if known else "whether they are noisy (dynamics_kwargs={'observation_noise': ...}), "
         warnings.warn(
             f"the trace on {data} is 'unexplained': what it looked for does not account for the difference, and the "
             "policy learns in a simulator that still errs; see print(model.loop.reports[-1]) for which joints, and "
             f"whether the observations hold the model's joints in its order, {noise}what else could be declared, and "
-            "dynamics='residual'",
+            f"dynamics='residual'{steps}",
             stacklevel=3,
         )
 

@@ -307,7 +307,7 @@ def _with_rewards(model: Resumable, arrays: dict[str, np.ndarray]) -> dict[str, 
         raise ValueError(f"target_data holds no rewards, and the task's are not known: {need}")
     if model.real_ratio > 0:
         model.real_ratio = 0.0
-        if model.updates_policy:
+        if model.updates_policy and not model._traces_log:  # whose transitions the critic does not see
             warnings.warn(
                 "target_data holds no rewards, and the task's are not known: real_ratio is 0 from here on, the critic "
                 "learns from the source's transitions alone",

@@ -7,7 +7,9 @@ import contextlib
 import difflib
 import importlib
 import inspect
+import os
 import re
+import sys
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -203,6 +205,9 @@ def _find(name: str, argument: str) -> World:
         name = tasks.env_id(name)
     package, _, env_id = name.rpartition(":")
     if package:
+        here = os.getcwd()
+        if here not in sys.path:  # as of python -m: a module beside the logs, say
+            sys.path.insert(0, here)
         try:
             importlib.import_module(package)
         except ImportError as error:
@@ -212,7 +217,10 @@ def _find(name: str, argument: str) -> World:
     shifted = re.fullmatch(r"rpto/(\w+)-(.+)-v0", env_id)
     if shifted and shifted[1] in tasks.TASKS:
         return World(name, tasks.env_id(shifted[1]), {"shift": shifted[2]})
-    raise ValueError(f"{argument} {name!r} is no environment{_perhaps(env_id, [*gym.registry, *tasks.TASKS])}")
+    perhaps = _perhaps(env_id, [*gym.registry, *tasks.TASKS])
+    if not perhaps and not package:
+        perhaps = f"; one of your own is module:{name}, of the module that registers it"
+    raise ValueError(f"{argument} {name!r} is no environment{perhaps}")
 
 
 def _perhaps(name: str, known: Iterable[str]) -> str:

@@ -69,7 +69,7 @@ def _simulator(env: VecEnv, backend: str) -> dict[str, Any]:
         return physical_config(env)
     except ValueError as error:
         raise ValueError(
-            f"dynamics={backend!r} needs a simulator whose numbers can be changed, which env is not: {error}; use "
+            f"dynamics={backend!r} cannot simulate env: {error}; without a simulator that can be changed and read, use "
             "dynamics='ensemble'"
         ) from error
 

@@ -11,7 +11,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.model import differing, load_model
 from sb3_rpto.effects.wrapper import beyond_model
-from sb3_rpto.envs.observations import StateMap, env_name, layers, mujoco_model, single_env, state_map
+from sb3_rpto.envs.observations import (
+    StateMap,
+    env_name,
+    layers,
+    leaves_observations,
+    mujoco_model,
+    single_env,
+    state_map,
+)
 from sb3_rpto.envs.steps import odd_state, odd_step
 
 
@@ -109,7 +117,9 @@ def check_states(env: gym.Env, recover: StateMap) -> None:
     """
     found = odd_state(env, recover)
     if found is not None:
+        strange = next((type(layer).__name__ for layer in layers(env)[:-1] if not leaves_observations(layer)), None)
         raise ValueError(
             f"{env_name(env)}: {found}; correct the map that register_state_map was given (order of joints, positions "
             "before velocities, signs, radians)"
+            + ("" if strange is None else f", or give env without the wrapper {strange}, which changes observations")
         )

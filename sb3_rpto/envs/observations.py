@@ -209,8 +209,7 @@ def state_map(env: gym.Env) -> StateMap:
             key = type(base).__name__ if env.spec is None else repr(name)
             raise ValueError(
                 f"{name}: how its observations (written by {author.__name__}._get_obs) follow from the state is not "
-                f"known; tell it with register_state_map({key}, ...), or record qpos and qvel and read them with "
-                "Measurements.from_tables"
+                f"known; tell it with register_state_map({key}, ...), in the module that registers the environment"
             )
     return StateMap(name, (model.nq, model.nv), shape[0], make(env))
 

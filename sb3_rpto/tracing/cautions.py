@@ -18,10 +18,10 @@ from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor, observed, predictions
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.prepare import SetUp
-from sb3_rpto.tracing.search import Found
+from sb3_rpto.tracing.misread import CLEARLY
+from sb3_rpto.tracing.prepare import SHORTER, SetUp
 from sb3_rpto.tracing.select import Selector
-from sb3_rpto.tracing.windows import cut
+from sb3_rpto.tracing.windows import cut, noise_levels
 
 JOINT, SLIDE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtJoint.mjJNT_SLIDE)
 #: Test runs that err by so many times their noise are told; over all of them together none of the benchmark's 187
@@ -32,8 +32,6 @@ APART = 3.0
 #: A declared number whose interval is wider than this share of itself and of its nominal value is not determined: it
 #: spans an order of magnitude. (Where both are next to nothing: of what is plausible.)
 VAGUE = 0.9
-#: Commands one sample earlier that leave less than this share of the error were logged after they had acted.
-EARLY = 0.5
 #: Share by which test runs must be predicted worse to be told.
 WORSE = 0.05
 #: Most windows that steps in time are compared in.
@@ -71,15 +69,18 @@ def missed(
     return [Finding("missed", ", ".join(runs), message)]
 
 
-def above_noise(after: list[HorizonError], floor: list[HorizonError], ratio: float) -> list[Finding]:
+def above_noise(after: list[HorizonError], floor: list[HorizonError], ratio: float, length: float) -> list[Finding]:
     """Whether a model that passes for adequate, as its few windows say little, errs clearly more than noise would.
 
     :param after: errors of the model on the test runs
     :param floor: what noise alone leaves there
     :param ratio: R, the same on the windows that decided
+    :param length: of those windows in s. Over much shorter ones counts what smoothing shifts the starts by, which is
+        no part of the floor
     """
     errors = {error.horizon: error.low for error in after}
-    clear = [level for level in floor if np.any(errors[level.horizon] > level.high)]
+    long = [level for level in floor if float(level.horizon) >= length / 2]
+    clear = [level for level in long if np.any(errors[level.horizon] > level.high)]
     if ratio <= 1 + TOLERANCE or not clear:
         return []
     message = (
@@ -145,26 +146,6 @@ def at_bounds(problem: Problem, values: np.ndarray) -> list[Finding]:
     return found
 
 
-def early_response(found: Found, data: Measurements) -> list[Finding]:
-    """Commands that were logged with the sample after they acted: no actuator acts before it is told."""
-    train, base = found.on.fine.train, found.base.fit
-    w, step = train.windows, float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
-    if w.exact or not w.drive.commands.shape[2]:
-        return []
-    rows = max(1, round(step / float(train.simulation.model.opt.timestep)))
-    commands = np.concatenate([w.drive.commands[:, rows:], w.drive.commands[:, -rows:]], axis=1)
-    earlier = Problem(train.simulation, replace(w, drive=w.drive._replace(commands=commands)), train.scales)
-    fit = earlier.fit(base.values, found.on.fine.free(()), base.starts)
-    share = float(np.median(fit.errors) / np.median(base.errors))
-    if share > EARLY:
-        return []
-    message = (
-        f"with all commands one sample ({step:.3g} s) earlier the declared model errs by {share:.0%} of what it does: "
-        "each row seems to hold the command of the row before; shift the ctrl columns up a row and trace again"
-    )
-    return [Finding("early response", "all episodes, ctrl", message)]
-
-
 def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> list[Finding]:
     """Whether dry friction, named or known, would leave less as MuJoCo's own, which creeps where nothing else is said.
 
@@ -227,6 +208,36 @@ def own_steps(
         'after are of finer ones: integrator="RK4" or a shorter timestep in the MJCF\'s <option> keeps them'
     )
     return [Finding("own steps", "corrected simulator", message)]
+
+
+def finer_steps(
+    problem: Problem, values: np.ndarray, free: np.ndarray, data: Measurements, horizon: float
+) -> list[Finding]:
+    """Whether transitions that pass for the model's own steps in time were made by finer ones.
+
+    :param problem: that the model was fitted to
+    :param values: of the fitted model, (p,)
+    :param free: indices of those that were fitted
+    :param data: that it was fitted to
+    :param horizon: length of its windows in s
+    """
+    if not data.exact:
+        return []
+    own = problem.simulation
+    model = own.model.__copy__()
+    model.opt.timestep /= SHORTER
+    finer = Simulation(model, [copy(e) for e in own.effects], own.nthread)
+    windows = cut(model, data, noise_levels(data), horizon, STEPPED)
+    fit = Problem(finer, windows, problem.scales).fit(values, free, iterations=SOFT_FIT)
+    finer_error, error = float(np.median(fit.errors)), float(np.median(problem.score(values).errors))
+    if finer_error >= CLEARLY * error:
+        return []
+    message = (
+        f"with steps of {1e3 * model.opt.timestep:.3g} ms in place of {1e3 * own.model.opt.timestep:.3g} ms the model "
+        f"errs by {finer_error / error:.0%} of what it does: the target moves more finely than the model does, as a "
+        "machine or another simulator; shorten the timestep in the MJCF's <option>, and raise frame_skip in proportion"
+    )
+    return [Finding("time step", "the model", message)]
 
 
 def no_nearer(before: Sequence[HorizonError], after: Sequence[HorizonError]) -> list[Finding]:

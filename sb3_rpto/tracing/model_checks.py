@@ -20,6 +20,8 @@ from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.windows import command_order, discretised, stiff
 
 ALL = "all episodes"
+MOSTLY = 0.5
+"""Commands of which a larger share is outside the actuator's range are refused: they are in other units."""
 SLOW = 0.02
 """A machine sampled at longer steps than this, in s, is said to be sampled slowly."""
 LONGEST_STEP = 0.5
@@ -59,8 +61,8 @@ def check_against(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     :param data: recordings, their names as in the model; the order of the columns does not matter
     :return: what was found, nothing is repaired
     :raises ValueError: joints or actuators that are not in both, or a wrong number of coordinates (the message names
-        the nearest names), actuators that integrate their commands, a clock that is not in seconds, ``param`` columns
-        with values that the number cannot have
+        the nearest names), actuators that integrate their commands, a clock that is not in seconds, commands that are
+        mostly out of range, ``param`` columns with values that the number cannot have
     """
     check_names(model, data)
     _check_actuators(model)
@@ -210,6 +212,12 @@ def _clipped(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
         slack = 1e-3 * (high - low)
         commands = np.concatenate([e.ctrl[:, column] for e in data.episodes])
         beyond = float(np.mean((commands < low - slack) | (commands > high + slack)))
+        if model.actuator_ctrllimited[i] and beyond > MOSTLY:
+            raise ValueError(
+                f"column 'ctrl.{name}': {beyond:.0%} of the samples are outside the model's ctrlrange [{low:g}, "
+                f"{high:g}], where it clips them; give commands in the units of the model's ctrl (a motor's force is "
+                "gear times ctrl), widen the range in the MJCF, or clip the column where the machine does"
+            )
         if model.actuator_ctrllimited[i] and beyond > 0:
             message = (
                 f"{beyond:.1%} of the samples are outside the model's ctrlrange [{low:g}, {high:g}], where it clips "

@@ -15,8 +15,8 @@ from sb3_rpto.tracing.adequacy import TOLERANCE, Adequacy
 from sb3_rpto.tracing.cautions import (
     above_noise,
     at_bounds,
-    early_response,
     encoder_zeros,
+    finer_steps,
     missed,
     no_nearer,
     own_steps,
@@ -32,6 +32,7 @@ from sb3_rpto.tracing.intervals import half_widths
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.loss import Loss
 from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.misread import misread
 from sb3_rpto.tracing.missing import missing_forces
 from sb3_rpto.tracing.model_checks import doubts
 from sb3_rpto.tracing.origin import may_be_exact, origin
@@ -170,11 +171,15 @@ def trace(
     floor = noise_floor(simulation, final, data, sigma, seed)
     if verdict in SETTLED:
         findings += missed(simulation, final, set_up.test, sigma, seed)
-        findings += above_noise(errors_after, floor, found.after.ratio) if set_up.test.episodes else []
+        findings += (
+            above_noise(errors_after, floor, found.after.ratio, selector.horizon) if set_up.test.episodes else []
+        )
         findings += own_steps(set_up.nominal, simulation, final, fitted, sigma, selector.horizon)
     else:
-        findings += doubts(set_up.nominal, fitted) + early_response(found, fitted)
+        findings += doubts(set_up.nominal, fitted) + misread(found, set_up)
         findings += no_nearer(errors_before, errors_after) if selection.model.effects else []
+        free = selector.free(selection.model.effects)
+        findings += finer_steps(problem, final, free, fitted, selector.horizon)
         findings += soft_instead(problem, final, selection.model.effects) if not fitted.simulated else []
     findings += undetermined(problem, final, intervals) + at_bounds(problem, final)
     findings += strays(selector, final, set_up, seed)

@@ -31,6 +31,7 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.zeros import Zeros
 
 TASK = "InvertedDoublePendulum-v5"
@@ -101,11 +102,13 @@ def test_a_trace_is_logged_before_any_episode_ends(soon: None, tmp_path: Path) -
 
 def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     made = filled([])
+    steps = [Finding("time step", "the model", "with steps of 1 ms it errs less")]
     monkeypatch.setattr(
-        closing, "trace", lambda *args, **kwargs: replace(trace(*args, **kwargs), verdict="unexplained")
+        closing, "trace", lambda *args, **kwargs: replace(trace(*args, **kwargs), verdict="unexplained", findings=steps)
     )
     assert made.loop is not None
-    with pytest.warns(UserWarning, match=r"on 101 target transitions is 'unexplained'.*reports\[-1\].*in its order"):
+    said = r"on 101 target transitions is 'unexplained'.*reports\[-1\].*in its order.*with steps of 1 ms it errs less$"
+    with pytest.warns(UserWarning, match=said):
         made.loop.close(made, dynamics(made))
 
 
@@ -946,6 +949,17 @@ def test_a_judged_policy_acts_where_learning_was_interrupted_and_nothing_is_lear
     made.learn(40, reset_num_timesteps=False)
     assert (made._n_updates - updates, made._owed) == (80, 0)
     assert not np.array_equal(begun[0], acting)  # the one that was interrupted
+
+
+def test_what_the_policy_that_acts_earns_is_the_last_word(capsys: pytest.CaptureFixture[str]) -> None:
+    made = forgetful()
+    assert made.loop is not None
+    made.loop.finish(made)
+    assert not capsys.readouterr().out
+    made.verbose = 1
+    made.loop.finish(made)
+    earns = f"{made.loop.rehearsals.best:.5g}"
+    assert capsys.readouterr().out.splitlines()[-1].endswith(f"the best so far, earns {earns} in the simulator")
 
 
 def test_parameters_that_a_user_sets_go_on_learning(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -207,10 +208,14 @@ def test_unknown_rewards_are_not_made_up() -> None:
     env = gym.wrappers.TransformReward(gym.make(TASK), lambda r: r)
     with pytest.raises(ValueError, match=r"holds no rewards.*pass real_ratio=0"):
         model(log(), env=env, real_ratio=0.05)
-    with pytest.warns(UserWarning, match="real_ratio is 0 from here on"):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*real_ratio")  # of a log that is traced the critic sees nothing
         made = model(log(), env=env)
     assert made.real_ratio == 0.0
     assert not chronological(made.replay_buffer.target)["rewards"].any()
+    with pytest.warns(UserWarning, match="real_ratio is 0 from here on"):
+        made = model(log(), env=env, dynamics="residual", declared=["hinge.damping"], weighting=None)
+    assert made.real_ratio == 0.0
 
 
 def test_networks_are_not_taught_that_unknown_rewards_are_zero() -> None:

@@ -425,6 +425,18 @@ def test_values_of_settings_are_what_python_users_mean(text: str, value: object)
     assert options.setting("train_freq=[1, episode]") == ("train_freq", (1, "episode"))  # YAML has no tuples
 
 
+def test_an_environment_of_ones_own_is_found_beside_the_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_arm.py").write_text(
+        "import gymnasium as gym\n"
+        "gym.register('mine/Arm-v7', 'gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv')\n"
+    )
+    with pytest.raises(ValueError, match="'mine/Arm-v7' is no environment; one of your own is module:mine/Arm-v7"):
+        options.world("mine/Arm-v7", "ENV")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert options.world("my_arm:mine/Arm-v7", "ENV").env_id == "mine/Arm-v7"
+
+
 def test_source_transitions_are_for_methods_with_a_use_for_them(
     agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,6 +20,7 @@ from sb3_rpto.effects import (
     from_json,
     register,
 )
+from sb3_rpto.effects.names import near
 from sb3_rpto.effects.trial import try_out
 
 XML = """
@@ -279,3 +280,5 @@ def test_registering_is_checked(cubic: type[Effect]) -> None:
     assert LIBRARY["cubic_drag"] is cubic
     with pytest.raises(ValueError, match="no effect 'cubic_drg' is registered; did you mean 'cubic_drag'"):
         from_json({"kind": "cubic_drg", "on": "", "values": {}})
+    kinds = ("coulomb_friction", "viscous_friction", "command_delay")
+    assert near("friction", kinds) == "did you mean 'coulomb_friction' or 'viscous_friction'?"

@@ -9,9 +9,10 @@ import pytest
 from sb3_rpto.effects import LIBRARY, Simulation
 from sb3_rpto.effects.forces import Spring, TorqueOffset
 from sb3_rpto.tracing import Measurements, trace
-from sb3_rpto.tracing.cautions import above_noise, encoder_zeros, no_nearer, own_steps
+from sb3_rpto.tracing.cautions import above_noise, encoder_zeros, finer_steps, no_nearer, own_steps
 from sb3_rpto.tracing.evaluate import HorizonError
-from sb3_rpto.tracing.windows import discretised
+from sb3_rpto.tracing.identify import Problem
+from sb3_rpto.tracing.windows import cut, discretised, noise_levels
 
 SERVO = """<mujoco><worldbody><body><joint name="elbow" axis="0 1 0"/><geom size="0.1"/></body></worldbody>
 <actuator>{}</actuator></mujoco>"""
@@ -26,8 +27,10 @@ def test_a_model_that_few_windows_pass_is_told_where_the_test_runs_deny_it(
     ratio: float, low: float, told: bool
 ) -> None:
     after = replace(ERROR, low=np.array([low, 0.9e-3]))
-    found = above_noise([after, replace(after, horizon="whole run")], [FLOOR], ratio)
+    errors = [after, replace(after, horizon="whole run")]
+    found = above_noise(errors, [FLOOR], ratio, length=0.8)
     assert [f.kind for f in found] == ["few windows"] * told
+    assert above_noise(errors, [FLOOR], ratio, length=1.1) == []  # over so little the starts decide
 
 
 def test_what_explains_nothing_and_predicts_worse_is_told() -> None:
@@ -58,6 +61,25 @@ def test_the_models_own_steps_are_compared_where_positions_are() -> None:
     assert "at swings, where the noise is 0.001" in found.message
     model.opt.timestep, model.opt.integrator = 0.002, mujoco.mjtIntegrator.mjINT_RK4
     assert own_steps(model, fine, fine.null, data, sigma, 0.5) == []
+
+
+@pytest.mark.parametrize(("step", "told"), [(0.02, False), (0.001, True)])
+def test_transitions_of_finer_steps_than_the_models_are_told(step: float, told: bool) -> None:
+    model, target = (mujoco.MjModel.from_xml_string(PAIR) for _ in range(2))
+    target.opt.timestep, state, rows = step, mujoco.MjData(target), []
+    state.qpos[:] = 0.3, 0.8
+    for _ in range(100):
+        rows.append([*state.qpos, *state.qvel])
+        mujoco.mj_step(target, state, round(0.04 / step))
+    table = dict(zip(("qpos.still", "qpos.swings", "qvel.still", "qvel.swings"), np.array(rows).T))
+    tables = {"run": {"time": 0.04 * np.arange(100), **table}}
+    data = replace(Measurements.from_tables(tables), exact=True, simulated=True)
+    own = Simulation(model, [], 1)
+    problem = Problem(own, cut(model, data, noise_levels(data), 0.16, 20), [])
+    found = finer_steps(problem, own.null, np.empty(0, dtype=int), data, 0.16)
+    assert [f.kind for f in found] == ["time step"] * told
+    assert not told or "with steps of 5 ms in place of 20 ms" in found[0].message
+    assert finer_steps(problem, own.null, np.empty(0, dtype=int), replace(data, exact=False), 0.16) == []
 
 
 def named(actuator: str, torque: float = -3.75) -> list[str]:

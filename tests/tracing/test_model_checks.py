@@ -248,3 +248,6 @@ def test_commands_that_the_model_clips():
     assert finding.where == "all episodes, ctrl.first"
     share = np.mean(np.abs(told["ctrl.first"]) > 0.501)
     assert finding.message.startswith(f"{share:.1%} of the samples are outside the model's ctrlrange [-0.5, 0.5]")
+    told["ctrl.first"] = 4.0 * told["ctrl.first"]  # N·m in place of shares
+    with pytest.raises(ValueError, match=r"'ctrl.first': \d\d% of the samples.*gear times ctrl"):
+        check_against(model, Measurements.from_tables({"run": told}))
