@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,7 +27,7 @@ from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.search import Selectors
 from sb3_rpto.tracing.select import Selector
 from sb3_rpto.tracing.turns import settle_turns
-from sb3_rpto.tracing.windows import BLOCK, Windows, cut, discretised, noise_levels
+from sb3_rpto.tracing.windows import BLOCK, MEMORY, Windows, cut, discretised, noise_levels
 
 #: Most windows to fit, and to select on.
 TRAIN, SELECT = 40, 40
@@ -271,6 +272,7 @@ def windows(
         enough = sum(float(np.ptp(e.time)) for e in train.episodes) > 2 * BLOCK  # for a third block to begin
         raise ValueError(
             f"the training runs hold {len(every)} window(s) of {horizon:g} s in fewer than three blocks of a "
-            f"second: too few to select on; record longer{', or lower horizon' if enough else ''}"
+            f"second: too few to select on; record longer, three runs or {math.ceil(2 * BLOCK + horizon + MEMORY):g} s "
+            f"and more to fit to{', or lower horizon' if enough else ''}"
         )
     return every, None
