@@ -78,12 +78,18 @@ def read_columns(names: Iterable[str], file: str) -> Columns:
     if doubled:
         raise ValueError(f"{file}: column {doubled[0]!r} is there twice; rename or remove one")
     found: dict[str, list[str]] = {prefix: [] for prefix in PREFIXES}
+    unknown = []
     for name in names:
         prefix, _, rest = name.partition(".")
         if prefix in found and rest:
             found[prefix].append(rest)
         elif name not in PLAIN:
-            raise ValueError(f"{file}: unknown column {name!r}; {_near(name)}; rename it, or drop what is not needed")
+            unknown.append(name)
+    if unknown:
+        also = f" (unknown, too: {', '.join(map(repr, unknown[1:]))})" if unknown[1:] else ""
+        raise ValueError(
+            f"{file}: unknown column {unknown[0]!r}; {_near(unknown[0])}; rename it, or drop what is not needed{also}"
+        )
     if "time" not in names:
         raise ValueError(f"{file}: no column 'time'; add the time of each sample in seconds")
     if not found["qpos"]:

@@ -131,6 +131,7 @@ def planted(value, row=7, column="qpos.hinge"):
         (edited(axle_pos=np.zeros(200)), r"unknown column 'axle_pos'; did you mean 'qpos.<name>'"),
         (edited(time=np.repeat(["2026-01-01 10:00"], 200)), r"'time' holds .*10:00.* in row 0 .*; give seconds since"),
         (edited(zzz=np.zeros(200)), r"unknown column 'zzz'; columns are"),
+        (edited(zzz=np.zeros(200), enc2=np.zeros(200)), r"'zzz'; .*drop what is not needed \(unknown, too: 'enc2'\)$"),
         ({"": np.arange(200), **swing()}, r"unknown column ''; an index .*index=False"),
         (edited(time=None), r"no column 'time'"),
         (edited(qpos__hinge=None, qvel__hinge=None), r"no column 'qpos.<joint>'"),

@@ -296,7 +296,9 @@ def test_a_single_run_is_traced_and_reported_as_not_held_out() -> None:
 
 
 def test_a_run_too_short_to_be_parted_into_blocks_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"too few to select on; record longer, three runs or \d s and more to fit to$"):
+    with pytest.raises(
+        ValueError, match=r"too few to select on; record longer, three runs or \d s and more to fit to$"
+    ):
         traced_simply(few(1, 2.0), horizon=None)
     with pytest.raises(ValueError, match=r"and more to fit to, or lower horizon$"):
         traced_simply(few(1, 2.3), horizon=1.0)
