@@ -5,9 +5,9 @@
 
 Targets differ from their source by numbers that are declared (lengths, masses, friction by up to 20 %), by these and
 an effect that nobody declared, or not at all; two fixed targets each. Compared are the source policy as it is, SAC
-fine-tuned in the target, RPTO with networks, RPTO with the simulator's numbers, and the same with the loop closed; an
-oracle that trained 100,000 steps in the target says what could be reached. Tables, figure and manifest go to
-examples/results/closed_loop.
+fine-tuned in the target, RPTO with networks, RPTO with the simulator's numbers, the same with the loop closed, and a
+policy of randomised sources, fine-tuned; an oracle that trained 100,000 steps in the target says what could be reached.
+Tables, figure and manifest go to examples/results/closed_loop.
 """
 
 from __future__ import annotations
