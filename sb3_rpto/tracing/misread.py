@@ -9,7 +9,7 @@ from itertools import combinations
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.names import object_names
+from sb3_rpto.effects.names import SCALAR_JOINTS, object_names
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.columns import joint_of
 from sb3_rpto.tracing.episodes import Episode
@@ -23,7 +23,6 @@ from sb3_rpto.tracing.windows import cut
 CLEARLY = 0.5
 #: Windows that ways of reading are compared in; so many that promise most are fitted, with so many iterations.
 WINDOWS, FITTED, ITERATIONS = 16, 3, 10
-_SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
         remedy = "each row seems to hold the command of the row before; shift the ctrl columns up a row"
         yield Reading("early response", "all episodes, ctrl", what, remedy, _earlier, positions)
     types = {name: int(model.jnt_type[i]) for i, name in enumerate(object_names(model, "joint"))}
-    scalar = [i for i, name in enumerate(columns.qpos) if types[joint_of(name)] in _SCALAR]
+    scalar = [i for i, name in enumerate(columns.qpos) if types[joint_of(name)] in SCALAR_JOINTS]
     scalar = [i for i in scalar if columns.qpos[i] not in data.unobserved]
     for i, j in combinations(scalar, 2):
         one, other = columns.qpos[i], columns.qpos[j]
