@@ -44,7 +44,8 @@ def near(name: str, known: Iterable[str]) -> str:
     """What to say after an unknown name: the near ones, or all when there are few."""
     known = list(known)
     parts = [other for other in known if len(name) > 2 and name in other]
-    close = parts if 0 < len(parts) <= 8 else difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    misspelt = difflib.get_close_matches(name, known, n=3, cutoff=0.8)
+    close = misspelt or parts[:8] or difflib.get_close_matches(name, known, n=3, cutoff=0.5)
     if close:
         return f"did you mean {' or '.join(map(repr, close))}?"
     return f"known: {', '.join(known[:12])}{' …' if len(known) > 12 else ''}" if known else "there are none"

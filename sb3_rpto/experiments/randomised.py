@@ -84,7 +84,7 @@ def randomised_agent(
         )
         model.learn(UPDATES * SOURCE_STEPS, callback=check, reset_num_timesteps=False)
         spent = {"updates": model._n_updates - before, "source_steps": model.num_timesteps}
-        spent["seconds"] = round(time.perf_counter() - began)
+        spent["seconds"] = round(time.perf_counter() - began, 2)
         write_atomically(cost, json.dumps(spent) + "\n")
         os.replace(Path(kept) / "best_model.zip", path)  # last: its presence says that both are there
     return dict(spent)
