@@ -83,11 +83,11 @@ def randomised_agent(
             verbose=0,
         )
         model.learn(UPDATES * SOURCE_STEPS, callback=check, reset_num_timesteps=False)
-        spent = {"updates": model._n_updates - before, "source_steps": model.num_timesteps}
+        spent: dict[str, float] = {"updates": model._n_updates - before, "source_steps": model.num_timesteps}
         spent["seconds"] = round(time.perf_counter() - began, 2)
         write_atomically(cost, json.dumps(spent) + "\n")
         os.replace(Path(kept) / "best_model.zip", path)  # last: its presence says that both are there
-    return dict(spent)
+    return spent
 
 
 def _randomised(make_source: MakeEnv, declared: Sequence[str], spread: float) -> gym.Env:
