@@ -15,10 +15,10 @@ from sb3_rpto.envs.observations import (
     StateMap,
     env_name,
     layers,
-    leaves_observations,
     mujoco_model,
     single_env,
     state_map,
+    strange_wrapper,
 )
 from sb3_rpto.envs.steps import odd_state, odd_step
 
@@ -117,7 +117,7 @@ def check_states(env: gym.Env, recover: StateMap) -> None:
     """
     found = odd_state(env, recover)
     if found is not None:
-        strange = next((type(layer).__name__ for layer in layers(env)[:-1] if not leaves_observations(layer)), None)
+        strange = strange_wrapper(env)
         raise ValueError(
             f"{env_name(env)}: {found}; correct the map that register_state_map was given (order of joints, positions "
             "before velocities, signs, radians)"

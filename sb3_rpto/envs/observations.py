@@ -188,17 +188,17 @@ def state_map(env: gym.Env) -> StateMap:
     make = _registered.get(env.spec.id if env.spec is not None else "")
     if make is None:
         make = next((_registered[cls] for cls in type(base).__mro__ if cls in _registered), None)
-    strange = next((layer for layer in layers(env)[:-1] if not leaves_observations(layer)), None)
+    strange = strange_wrapper(env)
     if make is not None and strange is not None:
         warnings.warn(
-            f"{name}: its registered state map is taken to know what the wrapper {type(strange).__name__} makes of the "
+            f"{name}: its registered state map is taken to know what the wrapper {strange} makes of the "
             "observations; give the environment without it where it does not",
             stacklevel=2,
         )
     if make is None:
         if strange is not None:
             raise ValueError(
-                f"{name}: what the wrapper {type(strange).__name__} makes of the observations is not known; give the "
+                f"{name}: what the wrapper {strange} makes of the observations is not known; give the "
                 "environment without it where it leaves them as they are, else use register_state_map"
             )
         # Whoever wrote _get_obs decides on the layout, however deep a class is derived.
@@ -212,6 +212,11 @@ def state_map(env: gym.Env) -> StateMap:
                 f"known; tell it with register_state_map({key}, ...), in the module that registers the environment"
             )
     return StateMap(name, (model.nq, model.nv), shape[0], make(env))
+
+
+def strange_wrapper(env: gym.Env) -> str | None:
+    """The outermost wrapper that is not known to leave observations as they are; None without one."""
+    return next((type(layer).__name__ for layer in layers(env)[:-1] if not leaves_observations(layer)), None)
 
 
 def leaves_observations(layer: gym.Env) -> bool:

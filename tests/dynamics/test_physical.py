@@ -22,6 +22,7 @@ from sb3_rpto.effects.commands import CommandDelay, CommandGain
 from sb3_rpto.effects.friction import StribeckFriction
 from sb3_rpto.effects.sensors import SensorBias
 from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.envs.observations import States, register_state_map
 
 
 def dynamics(env_id, declared=None, **kwargs):
@@ -472,3 +473,20 @@ def test_steps_do_not_touch_the_environment_they_were_given():
     model.step(th.zeros(2, 4), th.ones(2, 1))
     np.testing.assert_array_equal(env.unwrapped.state_vector(), before[0])
     np.testing.assert_array_equal(env.unwrapped.model.body_mass, before[1])
+
+
+def test_a_wrapper_that_changes_observations_is_named_where_a_registered_map_gives_other_states() -> None:
+    class Mine(type(gym.make("InvertedPendulum-v5").unwrapped)):  # type: ignore[misc]
+        """With the observations of its parent, told by a map of its own."""
+
+    def make(env):
+        return lambda obs: States(obs[:, :2], obs[:, 2:], np.ones((len(obs), 2), bool), np.ones((len(obs), 2), bool))
+
+    register_state_map(Mine, make)
+    plain = Mine()
+    physical_config(plain)
+    with (
+        pytest.warns(UserWarning, match="TransformObservation"),
+        pytest.raises(ValueError, match="wrapper TransformObs"),
+    ):
+        physical_config(wrappers.TransformObservation(plain, lambda obs: 2 * obs, plain.observation_space))
