@@ -73,7 +73,7 @@ def main() -> None:
     if rows.empty:
         parser.error(f"--runs: {a.runs} holds no run; ask for some by --seeds")
     rows.to_csv(out / "runs.csv", index=False)
-    tables = {"summary": study.summary(rows, oracles), "steps_to_90": study.steps_to(rows, oracles)}
+    tables = {"summary": study.summary(rows, oracles), "steps_to_90": study.steps_to_oracle(rows, oracles)}
     if oracles:
         best = [dict(zip(("task", "shift", "target", "return"), (*p, r))) for p, r in oracles.items()]
         tables["oracles"] = pd.DataFrame(best)

@@ -69,7 +69,7 @@ class DualReplayBuffer(ReplayBuffer):
         self._make_side = partial(side_class, observation_space=observation_space, action_space=action_space, **kwargs)
         self.source = self._make_side(buffer_size=buffer_size, device=device)
         self.target = self._make_side(buffer_size=target_size, device=device)
-        #: transitions that were ever added to the target side, those that it forgot included
+        #: transitions of this target that were ever added, those that its side forgot included
         self.target_added = 0
         #: observations of the real source environment, from which model branches may start; (n, observation_dim)
         self.source_starts = np.empty((0, *observation_space.shape), dtype=observation_space.dtype)
@@ -118,9 +118,9 @@ class DualReplayBuffer(ReplayBuffer):
         return self.source if world == "source" else self.target
 
     def reset(self) -> None:
-        """Forget both sides."""
-        self.source.reset()
+        """Forget the target side: to SB3 it is the replay buffer."""
         self.target.reset()
+        self.target_added = 0
 
     def add(
         self,

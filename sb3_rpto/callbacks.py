@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from itertools import islice
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
@@ -143,7 +144,7 @@ class RelativityGapCallback(TransferCallback):
         old, temperature = self._old_policy()
         values = []
         for policy in (self.model.policy, old):
-            with self._same_noise():
+            with self._same_noise(), _noise_of_each(policy.actor, len(seen)):
                 actions, log_prob = policy.actor.action_log_prob(seen)
             q = th.cat(old.critic_target(seen, actions), dim=1).min(dim=1)[0]
             values.append(q - temperature * log_prob.reshape(-1))
@@ -156,8 +157,6 @@ class RelativityGapCallback(TransferCallback):
             policy = type(self.model.policy)(**self.model.policy._get_constructor_parameters()).to(self.model.device)
             policy.load_state_dict(snapshot["policy"])
             policy.set_training_mode(False)
-            if self.model.use_sde:
-                policy.actor.reset_noise()
             self._old = snapshot, policy
         return self._old[1], snapshot["temperature"]
 
@@ -170,6 +169,21 @@ class RelativityGapCallback(TransferCallback):
     def _same_noise(self) -> AbstractContextManager[None]:
         """A block after which torch's random stream is where it was."""
         return th.random.fork_rng(devices=[self.model.device] if self.model.device.type == "cuda" else [])
+
+
+@contextmanager
+def _noise_of_each(actor: Actor, n: int) -> Iterator[None]:
+    """With gSDE, a block in which each of n states has an exploration matrix of its own, as each action has its noise.
+
+    The one that the actor explores by comes back.
+    """
+    held = vars(actor.action_dist).copy()
+    if actor.use_sde:
+        actor.reset_noise(n)
+    try:
+        yield
+    finally:
+        vars(actor.action_dist).update(held)
 
 
 class KeepBest(TransferCallback):

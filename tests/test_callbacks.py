@@ -260,6 +260,19 @@ def test_an_unchanged_policy_has_no_policy_gap(cls):
     assert log["gap/policy"] == log["gap/policy_se"] == 0.0
 
 
+@pytest.mark.parametrize("cls", [RPO, RPTO])
+def test_an_unchanged_policy_that_explores_by_states_has_no_policy_gap(cls):
+    model = small(cls, world(0.8), world(0.7), use_sde=True, gradient_steps=0)
+    model.learn(60, log_interval=None, source_timesteps=0)
+    callback = RelativityGapCallback()
+    callback.init_callback(model)
+    held = model.actor.action_dist.exploration_mat
+    gap = callback.policy_gap()
+    assert gap is not None
+    assert gap.mean == gap.standard_error == 0.0
+    assert model.actor.action_dist.exploration_mat is held
+
+
 def test_state_dependent_exploration():
     model = small(RPO, world(0.8), world(0.7), use_sde=True)
     recorded = Recorded(20)

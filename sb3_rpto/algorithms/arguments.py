@@ -352,9 +352,6 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
         raise ValueError(f"source_timesteps must be an integer and not negative, got {source_timesteps!r}")
     if model._offline and not model._traces_log and model.replay_buffer.target.size() == 0:
         raise ValueError("D_target is empty: a checkpoint does not hold the target_data; call load_replay_buffer()")
-    needs_rewards = model._offline and model.weighting is not None and not model._traces_log
-    if needs_rewards and not model.replay_buffer.target.rewards.any():
-        raise ValueError("target_data holds no rewards, which RTO's weight needs; pass weighting=None")
     _warn_of_little(model, total_timesteps)
     capacity = model.replay_buffer.target.buffer_size
     if model.target_env is not None and total_timesteps > capacity:

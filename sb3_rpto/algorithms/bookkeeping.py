@@ -147,7 +147,7 @@ class TwoWorlds(PolicySnapshots):
                     + ("log, whose states are estimates" if self._offline else f"target before{remedy}"),
                     stacklevel=2,
                 )
-                self.replay_buffer.target.reset()
+                self.replay_buffer.reset()
         if (self.target_env is not None or self._offline) and self._resume_state is not None:
             # Where that target stood, and a step of it that is not stored.
             self._resume_state |= {"target": None, "last_obs": None, "unstored_step": None}
@@ -169,7 +169,7 @@ class TwoWorlds(PolicySnapshots):
         """Warn, after the first fit (with the loop closed: after the first trace), where the simulator does not fit."""
         assert self.dynamics is not None
         self._judged_rules = self._judged_rules or doubt_rules(self.dynamics, data)
-        if self._judged_target or (self.loop is not None and not self.loop.found):
+        if self._judged_target or (self.loop is not None and not self.loop.traced):
             return
         self._judged_target = True
         doubt(self.dynamics, 0.0 if self._keeps_phi() else error)  # which is mostly noise there

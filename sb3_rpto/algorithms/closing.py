@@ -90,7 +90,12 @@ class LoopCloser:
     def forget_target(self) -> None:
         """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""
         self._traced_at, self._error, self.rehearsals, self.rounds = None, math.inf, Rehearsals(), None
-        self.accounts = self.keeps_phi = False
+        self._untraced = self.accounts = self.keeps_phi = False
+
+    @property
+    def traced(self) -> bool:
+        """Whether this target was traced, or a trace of it was tried and told that it could not be."""
+        return self._traced_at is not None
 
     def due(self, model: Looping, dynamics: PhysicalDynamics) -> bool:
         """Whether enough was seen for a first trace, for a better one than the last, or is no longer predicted."""

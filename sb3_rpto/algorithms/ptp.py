@@ -169,6 +169,8 @@ class PTP(MBPO):
         error_steps: int = 500,
         **kwargs: Any,
     ) -> None:
+        if n_candidates is None:
+            self._passed -= {"n_candidates"}
         self.n_candidates = self.NUMBERS["n_candidates"] if n_candidates is None else n_candidates
         self.horizon, self.beta, self.error_steps = horizon, beta, error_steps
         for name in ("n_candidates", "horizon", "error_steps"):

@@ -132,7 +132,7 @@ def fill_recorded(model: Resumable, measured: Measurements, effects: Sequence[Ef
     assert model.env is not None
     rules = {name: model.dynamics_kwargs.get(name) for name in ("reward_fn", "termination_fn")}
     arrays = recorded.transitions(measured, single_env(model.env), effects, **rules)
-    model.replay_buffer.target.reset()
+    model.replay_buffer.reset()
     if not len(arrays["actions"]):
         message = "target_data holds no whole step that begins where the task goes on"
         if not model._traces_log:
@@ -160,7 +160,8 @@ def begin_in_source(model: Resumable, source_timesteps: int, progress_bar: bool)
     learned = model.dynamics if model.dynamics is not None and model.dynamics.rollout == "branches" else None
     # Neither source_data nor an earlier run gave any. A run that goes on keeps what a closed loop left it.
     if len(buffer.source_starts) == 0 and (model.num_timesteps == 0 or buffer.source.size() == 0):
-        wanted = PHI_0_STEPS if learned is not None else min(FIRST_SOURCE_STEPS, model.buffer_size)
+        fits = learned is not None and not learned.fitted
+        wanted = PHI_0_STEPS if fits else min(FIRST_SOURCE_STEPS, model.buffer_size)
         buffer.resize_source(max(buffer.source.buffer_size, wanted))
         _collect_in_source(model, wanted - buffer.source.size())
         if learned is not None:

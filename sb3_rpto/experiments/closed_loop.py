@@ -24,7 +24,7 @@ from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments import sources
 from sb3_rpto.experiments.provenance import commit
 from sb3_rpto.experiments.randomised import randomised_agent
-from sb3_rpto.experiments.report import iqm_interval
+from sb3_rpto.experiments.report import enough, iqm_interval, steps_to
 from sb3_rpto.experiments.run import transfer
 from sb3_rpto.tracing.report import write_atomically
 
@@ -348,8 +348,8 @@ def summary(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float]) -> p
     return pd.DataFrame(lines)
 
 
-def steps_to(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float], share: float = 0.9) -> pd.DataFrame:
-    """First evaluation at which each run reached a share of its oracle: quartiles over runs, and how many did.
+def steps_to_oracle(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float]) -> pd.DataFrame:
+    """First evaluation at which each run was at 90 % of its oracle: quartiles over runs, and how many were.
 
     Targets without an oracle are left out.
     """
@@ -357,8 +357,7 @@ def steps_to(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float], sha
     for (task, shift, method), part in rows.groupby(["task", "shift", "method"], sort=False):
         reached = []
         for (target, _), one in part.groupby(["target", "seed"]):
-            enough = one[one["return"] >= share * oracles[task, shift, target]]
-            reached.append(float(enough.steps.min()) if len(enough) else np.inf)
+            reached.append(steps_to(one, enough(oracles[task, shift, target])))
         q = np.quantile(np.array(reached), [0.25, 0.5, 0.75], method="nearest")
         line = {"task": task, "shift": shift, "method": method, "runs": len(reached)}
         lines.append(line | dict(zip(("q25", "median", "q75"), q)) | {"reached": int(np.isfinite(reached).sum())})

@@ -190,10 +190,15 @@ def costs(rows: pd.DataFrame, references: Mapping[str, Mapping[str, float]]) -> 
         line |= {name: float(last[name].mean()) / max(budget, 1) for name in ("updates", "source_steps", "seconds")}
         line["model_error"] = float(last["model_error"].median()) if "model_error" in last else np.nan
         best = references.get(f"{task}_{target}", {}).get("oracle", np.nan)
-        reached = [steps_to(one, best - (1 - SHARE) * abs(best)) for _, one in part.groupby("seed")]
+        reached = [steps_to(one, enough(best)) for _, one in part.groupby("seed")]
         line |= {"reached": int(np.isfinite(reached).sum())}
         lines.append(line | {"steps_to": float(np.quantile(reached, 0.5, method="higher"))})
     return pd.DataFrame(lines)
+
+
+def enough(best: float) -> float:
+    """Of an oracle's return what leaves out no more than a share of 1 - :data:`SHARE`, also where it is negative."""
+    return best - (1 - SHARE) * abs(best)
 
 
 def steps_to(curve: pd.DataFrame, threshold: float) -> float:
@@ -202,8 +207,8 @@ def steps_to(curve: pd.DataFrame, threshold: float) -> float:
     :param curve: columns steps, return of one run
     :param threshold: a return
     """
-    enough = curve.loc[curve["return"] >= threshold, "steps"]
-    return float(enough.min()) if len(enough) else np.inf
+    reached = curve.loc[curve["return"] >= threshold, "steps"]
+    return float(reached.min()) if len(reached) else np.inf
 
 
 def firsts(lines: pd.DataFrame) -> pd.DataFrame:

@@ -977,6 +977,9 @@ def test_another_target_is_owed_nothing() -> None:
         made.set_target_env(target(friction()))
     assert made._owed == 0
     assert "learner" not in made.snapshots
+    assert made.replay_buffer.target_added == 0, "else a second trace of this target waits for twice both"
+    assert made.loop is not None
+    assert not made.loop.traced
 
 
 def test_what_is_owed_is_learned_where_a_new_trace_no_longer_accounts_for_the_target(

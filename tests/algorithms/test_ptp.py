@@ -1,5 +1,6 @@
 """PTP's choice among candidates on known error functions, and what its error network learns."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -101,6 +102,13 @@ def test_the_error_network_learns_where_the_model_errs():
     answer = network(observations, actions, predicted)
     assert np.corrcoef(answer, errors)[0, 1] > 0.9
     assert answer.mean() == pytest.approx(float(errors.mean()), rel=0.2)
+
+
+@pytest.mark.parametrize("passed", [{}, {"n_candidates": None}])
+def test_none_takes_the_papers_number_of_candidates_for_the_task(passed):
+    cheetahs = gym.make("HalfCheetah-v5"), gym.make("HalfCheetah-v5")
+    model = PTP("MlpPolicy", cheetahs[0], target_env=cheetahs[1], dynamics_kwargs={"hidden": (8,)}, **passed)
+    assert model.n_candidates == 6
 
 
 def test_until_the_first_fit_it_is_mbpo_then_the_network_chooses(monkeypatch):

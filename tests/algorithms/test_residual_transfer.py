@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto import RPTO
+from sb3_rpto.algorithms import warm
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.effects import LIBRARY
 from sb3_rpto.envs.corrected import apply_effects
@@ -29,6 +30,19 @@ def learned():
         **{"batch_size": 16, "policy_kwargs": {"net_arch": [16]}, "buffer_size": 500},
     )
     return made.learn(65, source_timesteps=50)
+
+
+def test_a_simulator_that_needs_no_fit_takes_few_source_steps_to_begin_with(monkeypatch):
+    made = RPTO(
+        *("MlpPolicy", gym.make(TASK)),
+        target_env=target(),
+        dynamics="residual",
+        dynamics_kwargs={"threads": 1, "ensemble_kwargs": TINY},
+        **{"seed": 0, "device": "cpu", "gradient_steps": 0, "source_steps": 2, "model_train_freq": 60},
+    )
+    monkeypatch.setattr(warm, "FIRST_SOURCE_STEPS", 40)
+    made.learn(1, source_timesteps=0)
+    assert len(made.replay_buffer.source_starts) == 40
 
 
 def test_it_learns_within_the_budget(learned):

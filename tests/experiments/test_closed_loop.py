@@ -93,11 +93,11 @@ def test_summary_says_what_was_spent_for_what() -> None:
 
 
 def test_steps_to_a_share_of_the_oracle() -> None:
-    line = study.steps_to(rows(), {("hopper", "none", 0): 760.0}).iloc[0]
+    line = study.steps_to_oracle(rows(), {("hopper", "none", 0): 760.0}).iloc[0]
     # 684 is reached at once by the third seed alone.
     assert (line["median"], line["reached"]) == (500, 3)
-    assert study.steps_to(rows(), {("hopper", "none", 0): 2000.0}).iloc[0]["reached"] == 0
-    assert study.steps_to(rows(), {("hopper", "none", 1): 1.0}).empty, "of an unknown oracle nothing is said"
+    assert study.steps_to_oracle(rows(), {("hopper", "none", 0): 2000.0}).iloc[0]["reached"] == 0
+    assert study.steps_to_oracle(rows(), {("hopper", "none", 1): 1.0}).empty, "of an unknown oracle nothing is said"
 
 
 def test_noisy_sensors_are_those_of_the_target_and_the_loop_is_told(
