@@ -233,7 +233,13 @@ def load_transitions(
     :param rewards_optional: whether an ``.npz`` may lack ``rew``; the result then has no ``rewards``
     :return: the arrays of :func:`chronological`
     :raises ValueError: for a table, a file with other contents, an empty set or values that are not finite
+    :raises TypeError: for anything else
     """
+    if not isinstance(data, str | pathlib.Path | ReplayBuffer | io.BufferedIOBase):
+        raise TypeError(
+            f"source_data and target_data are a replay buffer, its pickle or an .npz file, not {type(data).__name__}; "
+            "a robot's log is target_data=Measurements.from_csv(...), from_tables(...), ... (from sb3_rpto.tracing)"
+        )
     if isinstance(data, str | pathlib.Path) and str(data).endswith((".csv", ".parquet")):
         reader = f"Measurements.from_{str(data).rpartition('.')[2]}({str(data)!r})"
         raise ValueError(

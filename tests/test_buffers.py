@@ -178,6 +178,12 @@ def test_load_transitions_says_how_tables_are_read(name):
         load_transitions(name)
 
 
+@pytest.mark.parametrize("data", [{"time": [0.0]}, ["run.csv"], None])
+def test_load_transitions_says_what_it_reads(data):
+    with pytest.raises(TypeError, match=r"not \w+; a robot's log is target_data=Measurements"):
+        load_transitions(data)
+
+
 class Costly(ReplayBuffer):
     """Keeps what an environment says a step cost."""
 

@@ -269,13 +269,18 @@ def check_something_to_fit(
     :param traces_log: measurements stand in for the target
     :param passed: names of the arguments that the user passed
     :raises ValueError: with the remedy
-    :raises TypeError: for a single kind
+    :raises TypeError: for a single kind, and for what is no kind
     """
     if isinstance(close_loop, str):
         raise TypeError(f"close_loop must be True or a list of kinds, not a string; write [{close_loop!r}]")
     if not isinstance(close_loop, bool | Sequence | Set):
         raise TypeError(f"close_loop must be True, False or a list of kinds, not {close_loop!r}; leave it out")
     for kind in [] if isinstance(close_loop, bool) else close_loop:
+        if not isinstance(kind, str):
+            raise TypeError(
+                f"close_loop holds kinds of effects to look for, such as 'coulomb_friction', not {kind!r}; effects "
+                "that are known beforehand are dynamics_kwargs={'effects': [...]}"
+            )
         if kind not in LIBRARY:
             raise ValueError(f"close_loop: no effect {kind!r} is registered; {near(kind, LIBRARY)}")
     mujoco = config["backend"] == "physical" and is_mujoco(config)
@@ -301,6 +306,13 @@ def check_something_to_fit(
         model = config["model"]
         compiled = model.compile() if isinstance(model, PlainModel) else model
         given(compiled, config.get("declared", ()), [from_json(stored) for stored in config.get("effects", ())])
+    residual = config["backend"] == "residual"
+    late = [e.label for e in map(from_json, config.get("effects", ())) if e.remembers] if residual else []
+    if late:
+        raise ValueError(
+            f"dynamics='residual' answers each step from its observation alone, where {', '.join(late)} would be lost; "
+            "pass dynamics='physical', which simulates whole episodes"
+        )
     if mujoco and not close_loop and not config.get("declared") and not config.get("effects"):
         raise ValueError(
             "dynamics='physical' has nothing to fit: pass declared=[...], names of the model's numbers such as "

@@ -118,7 +118,8 @@ class LoopCloser:
     def first_comes_after(self, model: TwoWorlds) -> int:
         """How many target steps the first trace still waits for; 0 or less where it is due or was made."""
         side = model.replay_buffer.target
-        return 0 if self._traced_at is not None else min(FIRST, side.buffer_size) - side.size()
+        most = side.size() if model._offline else side.buffer_size  # recorded transitions become no more
+        return 0 if self._traced_at is not None else min(FIRST, most) - side.size()
 
     def close(self, model: Looping, dynamics: PhysicalDynamics) -> None:
         """Trace on D_target, keep what lowers the error, log it, and renew D_source where another simulator made it.
@@ -369,12 +370,13 @@ def _say(model: Looping, report: Report, added: list[str], data: str, before: fl
     if report.verdict == "unexplained":
         known = model.measured is not None or model.dynamics_kwargs.get("observation_noise") is not None
         steps = "".join(f". {f.message}" for f in report.findings if f.kind == "time step")
+        bounds = "".join(f". {f.where}: {f.message}" for f in report.findings if f.kind == "at its bound")
         noise = "" if known else "whether they are noisy (dynamics_kwargs={'observation_noise': ...}), "
         warnings.warn(
             f"the trace on {data} is 'unexplained': what it looked for does not account for the difference, and the "
             "policy learns in a simulator that still errs; see print(model.loop.reports[-1]) for which joints, and "
             f"whether the observations hold the model's joints in its order, {noise}what else could be declared, and "
-            f"dynamics='residual'{steps}",
+            f"dynamics='residual'{steps}{bounds}",
             stacklevel=3,
         )
 

@@ -36,6 +36,9 @@ def dynamics_config(backend: str, env: VecEnv, kwargs: dict[str, Any], declared:
         return {"backend": backend, **_rules(env), **kwargs}
     if backend in ("physical", "residual"):
         config = {"backend": backend, **_simulator(env, backend)}
+        taken = sorted(kwargs.keys() & config.keys())
+        if taken:
+            raise ValueError(f"dynamics_kwargs={taken} are read off the source environment; leave them out")
         if backend == "residual":
             config |= _rules(env)
         return {**config, **kwargs, **({"declared": tuple(declared)} if declared else {})}

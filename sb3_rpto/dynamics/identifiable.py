@@ -12,20 +12,19 @@ NULL = 5e-8
 LOAD = 0.05
 
 
-def null_directions(slopes: np.ndarray, shown: np.ndarray) -> np.ndarray:
+def null_directions(normal: np.ndarray, shown: np.ndarray) -> np.ndarray:
     """Directions in which phi moves no residual although its parameters do one by one, (p, k), unit length, in scales.
 
-    :param slopes: weighted derivatives of the residuals by phi in scales, (m, p)
+    :param normal: Gauss-Newton matrix of the residuals by phi in scales, (p, p)
     :param shown: parameters that move residuals at all, (p,); the others belong to no direction
     """
-    size = np.sqrt((slopes**2).sum(axis=0))
+    size = np.sqrt(np.diag(normal))
     free = np.flatnonzero(shown & (size > 0))
     if len(free) < 2:
-        return np.zeros((slopes.shape[1], 0))
-    alike = slopes[:, free] / size[free]
-    eigenvalues, vectors = np.linalg.eigh(alike.T @ alike)
+        return np.zeros((len(normal), 0))
+    eigenvalues, vectors = np.linalg.eigh(normal[np.ix_(free, free)] / np.outer(size[free], size[free]))
     found = vectors[:, eigenvalues < NULL * eigenvalues[-1]]
-    directions = np.zeros((slopes.shape[1], found.shape[1]))
+    directions = np.zeros((len(normal), found.shape[1]))
     directions[free] = found / size[free, None]
     return np.asarray(directions / np.linalg.norm(directions, axis=0))
 

@@ -199,7 +199,7 @@ class OneStep:
         self.clip = _clip(residual)
         # One-sided differences of products such as gear x gain would leave a trace of the direction.
         a, b = self._weighted(residual, (up + down) / 2)
-        directions = null_directions(a, _shown(a, b))
+        directions = null_directions(a.T @ a, _shown(a, b))
         self.entangled, self.held = entangled(directions), to_hold(directions)
 
     def step(self, values: np.ndarray, max_step: float) -> np.ndarray | None:

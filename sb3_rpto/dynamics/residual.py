@@ -115,6 +115,10 @@ class ResidualDynamics(Dynamics):
         self.physical.adopt(found)
         self.corrected.fill_(False)
 
+    def effects(self) -> list[Effect]:
+        """What the simulator's phi is, without the networks' part, for :func:`~sb3_rpto.apply_effects`."""
+        return self.physical.effects()
+
     def describe(self) -> dict[str, float]:
         """The simulator's phi by name, with the standard deviations."""
         return self.physical.describe()

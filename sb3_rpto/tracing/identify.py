@@ -163,7 +163,12 @@ class Problem:
         return np.where(values + step > self.upper, -step, step)
 
     def linearise(
-        self, values: np.ndarray, starts: np.ndarray, free: np.ndarray, base: np.ndarray | None = None
+        self,
+        values: np.ndarray,
+        starts: np.ndarray,
+        free: np.ndarray,
+        base: np.ndarray | None = None,
+        down: bool = False,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residuals and their derivatives by the free parameters (in plausible sizes) and by the start.
 
@@ -171,6 +176,7 @@ class Problem:
         :param starts: (W, 2 nv)
         :param free: (f,) indices
         :param base: the residuals, (W, R), where they are known from before
+        :param down: the parameters' differences are taken on the other side
         :return: (W, R), (W, R, f), (W, R, x)
         """
         count, f, x = len(self.windows), len(free), len(self.moving)
@@ -179,7 +185,7 @@ class Problem:
         columns, p = f + x + (base is None), values.shape[-1]
         all_values = np.tile(np.broadcast_to(values, (count, p)), (columns, 1, 1))
         all_starts = np.tile(starts, (columns, 1, 1))
-        step = self.steps(values)[free] if f else np.empty(0)
+        step = self.steps(values)[free] * (-1 if down else 1) if f else np.empty(0)
         for i, parameter in enumerate(free):
             all_values[i, :, parameter] += step[i]
         for i, coordinate in enumerate(self.moving):

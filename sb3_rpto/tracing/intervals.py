@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import t as student
 
-from sb3_rpto.tracing.identify import Linear
+from sb3_rpto.dynamics.identifiable import entangled, null_directions, to_hold
+from sb3_rpto.tracing.concentrate import NOTHING
+from sb3_rpto.tracing.identify import Fit, Linear, Problem
+from sb3_rpto.tracing.loss import Loss
 
 #: What rests on fewer blocks has no interval: one alone does not scatter.
 LEAST = 1.5
@@ -34,3 +37,24 @@ def half_widths(linear: Linear, block: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         spread = np.sqrt((moves**2).sum(0) * count / (count - 1)) * student.ppf(0.975, np.maximum(count - 1, 1))
     return np.where(count < LEAST, np.nan, spread)
+
+
+def not_told_apart(problem: Problem, fit: Fit, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Free parameters that only move the predictions together with others, such as a motor's gear and its gain.
+
+    :param fit: of all windows
+    :param free: indices, (f,)
+    :return: indices of them, those that are effects to be found included; and of one that was given for each direction
+        in which nothing moves: with these held the others are determined
+    """
+    given = problem.known[free]
+    if given.sum() < 2:
+        return free[:0], free[:0]
+    # One-sided differences of products such as gear x gain would leave a trace of the direction.
+    (r, up, jx), (_, down, _) = (problem.linearise(fit.values, fit.starts, free, down=d) for d in (False, True))
+    normal = problem.reduce(r, (up + down) / 2, jx, fit.starts, Loss.of(r)).normal.sum(0)
+    order = np.argsort(given, kind="stable")  # the last is held: something that was given, where there is one
+    size = np.diag(normal)[order]
+    directions = null_directions(normal[np.ix_(order, order)], size > NOTHING * size.max())
+    held = to_hold(directions) & given[order]
+    return free[order[entangled(directions)]], free[order[held]]

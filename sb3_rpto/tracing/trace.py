@@ -28,7 +28,7 @@ from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.concentrate import NOTHING
 from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Fit, Problem
-from sb3_rpto.tracing.intervals import half_widths
+from sb3_rpto.tracing.intervals import half_widths, not_told_apart
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.loss import Loss
 from sb3_rpto.tracing.measurements import Measurements
@@ -271,12 +271,20 @@ def _steady(progress: Progress | None) -> Progress:
 def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Fit on train and select together.
 
-    :return: all parameters (p,), and the bounds of their 95 % intervals (2, p), NaN where nothing was fitted: what
-        shows in no window is what it was
+    Of what was given and only shows together, the last one stays what it was.
+
+    :return: all parameters (p,), and the bounds of their 95 % intervals (2, p), NaN where nothing was fitted, where
+        only several together are told, and where nothing shows in any window, which is what it was
     """
     joined = problem.windows
     free = Selector(problem, problem, 0.0, lambda share, what: None).free(selection.model.effects)
     fit = problem.fit(selection.model.fit.values, free, iterations=FINAL, crude=0.0)
+    alike, held = not_told_apart(problem, fit, free)
+    if len(held):
+        begin = fit.values.copy()
+        begin[held] = problem.null[held]
+        free = np.setdiff1d(free, held)
+        fit = problem.fit(begin, free, iterations=FINAL, crude=0.0)
     values, intervals = fit.values.copy(), np.full((2, len(fit.values)), np.nan)
     if len(free):
         linear = problem.linear(fit, free)
@@ -288,7 +296,7 @@ def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarra
         half = half_widths(linear, joined.block) * problem.size[free] / Loss.of(r).curvature(r)
         intervals[:, free] = fit.values[free] + np.array([-1, 1])[:, None] * half
         intervals = np.clip(intervals, problem.lower, problem.upper)
-        intervals[:, hidden] = np.nan
+        intervals[:, hidden] = intervals[:, alike] = np.nan
     return values, intervals
 
 

@@ -115,12 +115,17 @@ class Homing(Problem):
         return super().predict(inner, starts, index)
 
     def linearise(
-        self, values: np.ndarray, starts: np.ndarray, free: np.ndarray, base: np.ndarray | None = None
+        self,
+        values: np.ndarray,
+        starts: np.ndarray,
+        free: np.ndarray,
+        base: np.ndarray | None = None,
+        down: bool = False,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As of a problem with one zero; the derivatives by those of other runs vanish."""
         joints = np.flatnonzero(np.isin(self.own, free).any(axis=0))
         moved = np.union1d(free[free < self.common], self.bias[joints])
-        r, found, jx = super().linearise(values, starts, moved, base)
+        r, found, jx = super().linearise(values, starts, moved, base, down)
         jt = np.zeros((*r.shape, len(free)))
         for i, parameter in enumerate(free):
             if parameter < self.common:

@@ -102,12 +102,16 @@ def test_a_trace_is_logged_before_any_episode_ends(soon: None, tmp_path: Path) -
 
 def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     made = filled([])
-    steps = [Finding("time step", "the model", "with steps of 1 ms it errs less")]
+    steps = [
+        Finding("time step", "the model", "with steps of 1 ms it errs less"),
+        Finding("at its bound", "declared pole.length", "0.3 is its bound"),
+    ]
     monkeypatch.setattr(
         closing, "trace", lambda *args, **kwargs: replace(trace(*args, **kwargs), verdict="unexplained", findings=steps)
     )
     assert made.loop is not None
-    said = r"on 101 target transitions is 'unexplained'.*reports\[-1\].*in its order.*with steps of 1 ms it errs less$"
+    said = r"on 101 target transitions is 'unexplained'.*reports\[-1\].*in its order.*with steps of 1 ms it errs less"
+    said += r". declared pole.length: 0.3 is its bound$"
     with pytest.warns(UserWarning, match=said):
         made.loop.close(made, dynamics(made))
 
@@ -623,11 +627,27 @@ def test_long_names_of_effects_are_logged(soon: None) -> None:
         ({"dynamics_kwargs": {"observation_noise": -1e-3}}, "standard deviation above 0"),
         ({"dynamics_kwargs": {"observation_noise": [1e-3] * 5}}, "each of the 9 observations"),
         ({"dynamics_kwargs": {"observation_noise": "much"}}, "'much'; give a standard deviation"),
+        ({"dynamics_kwargs": {"frame_skip": 0}}, r"\['frame_skip'\] are read off the source environment"),
     ],
 )
 def test_what_cannot_be_closed_is_refused(settings: dict[str, object], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         model([], **settings)
+
+
+@pytest.mark.parametrize("kind", [friction()[0], type(friction()[0]), 1])
+def test_what_to_look_for_is_told_by_kinds(kind: object) -> None:
+    with pytest.raises(TypeError, match=r"close_loop holds kinds .*dynamics_kwargs=\{'effects'"):
+        model([], close_loop=[kind])
+
+
+def test_recorded_transitions_that_are_few_are_traced_as_they_become_no_more() -> None:
+    recorded = filled(friction()).replay_buffer
+    made = model([], target_env=None, target_data=recorded, model_train_freq=20)
+    made.learn(40, source_timesteps=0)
+    assert made.loop is not None
+    assert recorded.target.size() == 101 < closing.FIRST
+    assert [found["verdict"] for found in made.loop.found] == ["explained"]
 
 
 def test_rpo_has_no_loop_to_close() -> None:

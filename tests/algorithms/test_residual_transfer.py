@@ -45,6 +45,23 @@ def test_a_simulator_that_needs_no_fit_takes_few_source_steps_to_begin_with(monk
     assert len(made.replay_buffer.source_starts) == 40
 
 
+def test_what_acts_late_is_refused_before_it_is_lost():
+    late = LIBRARY["command_delay"]("slide", delay=0.04)
+    with pytest.raises(ValueError, match=r"command_delay\(slide\) would be lost; pass dynamics='physical'"):
+        RPTO(
+            *("MlpPolicy", gym.make(TASK)),
+            target_env=target(),
+            dynamics="residual",
+            dynamics_kwargs={"effects": [late]},
+        )
+
+
+def test_its_simulator_is_had_without_the_networks(learned):
+    corrected = apply_effects(gym.make(TASK), learned.dynamics.effects())
+    mass = corrected.unwrapped.model.body("pole").mass[0]
+    assert mass == pytest.approx(learned.dynamics.describe()["pole.mass"], rel=1e-6)
+
+
 def test_it_learns_within_the_budget(learned):
     assert learned.num_timesteps == learned.target_spent["learning"] == 65
     assert isinstance(learned.dynamics, ResidualDynamics)

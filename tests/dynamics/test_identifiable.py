@@ -26,7 +26,8 @@ A, B, C = rng.standard_normal((3, 40))
 )
 def test_directions_are_found(columns, shown, together, held):
     shown = np.ones(len(columns), dtype=bool) if shown is None else np.array(shown)
-    directions = null_directions(np.stack(columns, axis=1), shown)
-    np.testing.assert_allclose(np.stack(columns, axis=1) @ directions, 0, atol=1e-6)
+    slopes = np.stack(columns, axis=1)
+    directions = null_directions(slopes.T @ slopes, shown)
+    np.testing.assert_allclose(slopes @ directions, 0, atol=1e-6)
     assert np.flatnonzero(entangled(directions)).tolist() == together
     assert np.flatnonzero(to_hold(directions)).tolist() == held

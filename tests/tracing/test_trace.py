@@ -413,6 +413,20 @@ def test_an_unchanged_environment_is_complete_without_error() -> None:
     assert np.all(np.isnan(report.learnable))  # of rounding
 
 
+def test_of_numbers_that_only_show_together_the_last_stays_what_it_was() -> None:
+    """A motor's gear and its gain, one of them beside friction that nobody declared."""
+    env, data = driven(1.0)
+    alike = ["cart.mass", "slide.gear", "slide.gain"]
+    report = trace(env, data, alike, candidates=["coulomb_friction"], threads=1)
+    mass, gear, gain = report.declared
+    assert (float(gear.effect.values[0]), float(gain.effect.values[0])) == pytest.approx((500.0, 1.0), rel=1e-3)
+    assert gain.effect.values[0] == 1.0
+    assert np.isnan([gear.interval, gain.interval]).all()
+    assert np.isfinite(mass.interval).all()
+    said = [f.where for f in report.findings if f.kind == "undetermined"]
+    assert said == ["declared slide.gear", "declared slide.gain"]
+
+
 def test_dry_friction_that_an_environment_lacks_is_found() -> None:
     env, data = driven(1.0)
     report = trace(env, data, candidates=NATIVE, threads=1)
