@@ -29,7 +29,8 @@ from sb3_rpto.algorithms.update import as_transitions
 from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.products import fast_products
-from sb3_rpto.experiments.run import LearningCurve, fine_tuned_sac
+from sb3_rpto.experiments.baselines import fine_tuned_sac
+from sb3_rpto.experiments.run import LearningCurve
 
 #: Mean return in the source at which the policy counts as converged: 9,360 is the most there is.
 SOLVED = 9_300

@@ -42,6 +42,7 @@ class DualReplayBuffer(ReplayBuffer):
     :param side_class: the replay buffer class of each side
     :param side_kwargs: further arguments of each side's constructor
     :raises NotImplementedError: for ``optimize_memory_usage=True``
+    :raises ValueError: for a ``target_size`` that is no positive integer
     """
 
     def __init__(
@@ -112,7 +113,10 @@ class DualReplayBuffer(ReplayBuffer):
         self.source.device = self.target.device = value
 
     def side(self, world: World) -> ReplayBuffer:
-        """The replay buffer of one world."""
+        """The replay buffer of one world.
+
+        :raises ValueError: there is no such world
+        """
         if world not in ("source", "target"):
             raise ValueError(f'world must be "source" or "target", not {world!r}')
         return self.source if world == "source" else self.target
@@ -192,7 +196,10 @@ class DualReplayBuffer(ReplayBuffer):
         side.pos = (side.pos + n) % side.buffer_size
 
     def sample(self, batch_size: int, env: VecNormalize | None = None, world: World = "target") -> ReplayBufferSamples:
-        """Draw transitions uniformly from one world; as SB3's ``ReplayBuffer.sample`` on that side."""
+        """Draw transitions uniformly from one world; as SB3's ``ReplayBuffer.sample`` on that side.
+
+        :raises ValueError: that side is empty, or there is no such world
+        """
         side = self.side(world)
         if side.size() == 0:
             raise ValueError(f"the {world} side of the replay buffer is empty: nothing can be sampled from it")

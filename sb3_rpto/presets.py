@@ -26,7 +26,7 @@ def resolve_preset(preset: str, backend: str, env_id: str | None, passed: Collec
     documented default.
 
     :param preset: name of a shipped preset
-    :param backend: "real" (RPO), "ensemble" or "physical"
+    :param backend: the section of the source's kind: "real" (RPO), "ensemble", "physical", "mujoco" or "residual"
     :param env_id: id of the source environment, None when it has none
     :param passed: names of the arguments that the user passed
     :raises ValueError: for a preset that does not exist

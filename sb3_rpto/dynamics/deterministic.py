@@ -120,13 +120,15 @@ class DeterministicDynamics(EnsembleDynamics):
 
         :param data: at least two transitions, oldest first
         :param weights: (n,), how often each row begins a sequence, not negative; None: all alike
-        :param max_steps: gradient steps; None for the constructor's
+        :param max_steps: gradient steps, at least 1; None for the constructor's
         :return: ``open_loop_loss`` (mean over the last tenth of the steps), ``steps``, ``fit_seconds``
         :raises ValueError: too few transitions, a wrong shape, values that are not finite, bad weights
         """
         started = time.perf_counter()
         self._prepare(data, weights)  # checks, and fits the scaler if this is the first time
         n_steps = self.max_steps if max_steps is None else max_steps
+        if n_steps < 1:
+            raise ValueError(f"max_steps must be at least 1, got {n_steps}")
         horizon = min(self.horizon, len(data))
         dtype = self.input_mean.dtype
         following = self._successors(data)

@@ -12,6 +12,7 @@ from scipy.optimize import lsq_linear
 from sb3_rpto.dynamics.base import Transitions, predecessors
 from sb3_rpto.dynamics.identifiable import entangled, null_directions, to_hold
 from sb3_rpto.effects import Simulation
+from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.sensors import ago
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.envs.observations import StateMap
@@ -97,9 +98,7 @@ def as_steps(
     ever = known.any(axis=0) | _known_at_rest(recover)
     kept = np.flatnonzero(known[:, ever].all(axis=1))
     rows = chosen[kept]
-    limited = model.actuator_ctrllimited.astype(bool)
-    low, high = np.where(limited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf)).T
-    commands = np.clip(actions, low, high)
+    commands = np.clip(actions, *command_limits(model))
     before = predecessors(observations, next_observations)
     drive = np.repeat(_history(commands, before, rows, earlier), frame_skip, axis=1)
     begun, reached = (np.nan_to_num(np.concatenate([s.qpos, s.qvel], axis=1))[kept] for s in (now, then))

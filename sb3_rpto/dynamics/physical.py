@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
 from sb3_rpto.dynamics.onestep import BLOWN, OneStep, Steps, as_steps
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
+from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.effect import from_json
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.simulation import Drive
@@ -192,18 +193,12 @@ class PhysicalDynamics(Dynamics):
         :param actions: of the transitions from there on, (n, length, nu)
         """
         states = self.recover(observations.astype(np.float64))
-        commands = np.repeat(np.clip(actions.astype(np.float64), *self._limits()), self.frame_skip, axis=1)
+        commands = np.repeat(np.clip(actions.astype(np.float64), *command_limits(self.model)), self.frame_skip, axis=1)
         qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
         values = np.tile(self.values, (len(observations), 1))
         self.simulation.undo_sensors(values, qpos, qvel)
         q, v = self.simulation.rollout(values, qpos, qvel, Drive(commands))
         return bool(np.isfinite(q).all() and np.isfinite(v).all())
-
-    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Smallest and largest commands, (nu,)."""
-        limited = self.model.actuator_ctrllimited.astype(bool)
-        low, high = np.where(limited[:, None], self.model.actuator_ctrlrange, (-np.inf, np.inf)).T
-        return low, high
 
     def declared_at_bounds(self) -> list[str]:
         """Names and values of declared numbers that have moved to a bound."""

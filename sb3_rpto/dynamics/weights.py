@@ -28,7 +28,7 @@ def rto_weights(
     - ``"paper"``: (r + gamma (1 - done) V(s'))^2, Eq. rto_p2 with the temperature that the paper leaves out.
     - ``"centred"``: (r + gamma (1 - done) V(s') - Q(s, a))^2: unlike the literal weight it does not change when a
       constant is added to the reward, as the gap it comes from does not.
-    - ``"value_aware"``: (V(s_hat') - V(s'))^2, what the model's own error costs in value.
+    - ``"value_aware"``: ((1 - done_hat) V(s_hat') - (1 - done) V(s'))^2, what the model's own error costs in value.
 
     :param data: transitions of the target
     :param dynamics: the model that is being fitted, for ``"value_aware"``

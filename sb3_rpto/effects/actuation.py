@@ -16,6 +16,13 @@ _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 _JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
+def command_limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest command of each actuator, in its unit, (nu,) each; infinite where it is not limited."""
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = np.where(limited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf)).T
+    return low, high
+
+
 def memoryless(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether an actuator's force follows from its command and its joint alone: no activation, delay or tendon."""
     return bool(

@@ -100,7 +100,7 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
         :func:`load_corrected` refuses
     :param source: the nominal model, see :func:`~sb3_rpto.effects.model.load_model`; not an MjModel alone
     :param effects: with their values
-    :raises ValueError: nothing tells the MJCF of ``source``, or it has effects that are no numbers of its model, or it
+    :raises ValueError: nothing tells the MJCF of ``source``, or it has effects that are no numbers of its model, or
         ``folder`` holds a ``model.xml`` that must not be overwritten: the nominal one, or none of this function's
     :raises FileNotFoundError: an asset is missing
     """

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.actuation import FILTERS
+from sb3_rpto.effects.actuation import FILTERS, command_limits
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.engine import lean, quiet, untimed
@@ -294,10 +294,9 @@ def settled(model: mujoco.MjModel, ctrl: np.ndarray) -> np.ndarray:
     :param ctrl: (n, nu)
     :return: (n, na)
     """
-    act = np.zeros((len(ctrl), model.na))
+    act, sent = np.zeros((len(ctrl), model.na)), np.clip(ctrl, *command_limits(model))
     for i in np.flatnonzero(np.isin(model.actuator_dyntype, FILTERS)):
-        low, high = model.actuator_ctrlrange[i] if model.actuator_ctrllimited[i] else (-np.inf, np.inf)
-        act[:, model.actuator_actadr[i]] = np.clip(ctrl[:, i], low, high)
+        act[:, model.actuator_actadr[i]] = sent[:, i]
     return act
 
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-#: Fields whose change asks for mj_setConst, and MjOption fields that do not.
+#: Fields whose change asks for mj_setConst.
 _DERIVING = frozenset(mujoco.MjModel._setconst_inputs)
 
 

@@ -8,6 +8,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.engine import quiet
 from sb3_rpto.envs.observations import StateMap
 from sb3_rpto.envs.state import copy_env
@@ -33,8 +34,7 @@ def odd_step(env: gym.Env, frame_skip: int) -> str | None:
         return None
     base: Any = twin.unwrapped
     twin.action_space.seed(0)
-    limited = base.model.actuator_ctrllimited.astype(bool)[:, None]
-    low, high = np.where(limited, base.model.actuator_ctrlrange, (-np.inf, np.inf)).T
+    low, high = command_limits(base.model)
     for seed in range(TRIED):
         twin.reset(seed=seed)
         action = twin.action_space.sample()

@@ -11,7 +11,7 @@ from typing import Any
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_rpto.algorithms import RPTO
-from sb3_rpto.experiments.methods import REGISTRY, Method, two_worlds
+from sb3_rpto.experiments.methods import Method, two_worlds
 
 #: The factors and their levels.
 FACTORS: dict[str, tuple[str, ...]] = {
@@ -32,7 +32,7 @@ class WithoutRPO(RPTO):
 
 
 #: Methods beside those of the registry.
-ABLATED = {"rpto-without-rpo": Method(partial(two_worlds, WithoutRPO), REGISTRY["rpto"].updates)}
+ABLATED = {"rpto-without-rpo": Method(partial(two_worlds, WithoutRPO))}
 
 
 @dataclass(frozen=True)

@@ -62,13 +62,11 @@ class Method:
     """A method of the harness.
 
     :param run: spends exactly the budget of target steps and leaves the curve's rows
-    :param updates: published updates per target step of a task (its id, or None), of policy or critic
     :param in_batches: learns from many target steps at once, so that it is evaluated after it has
     :param takes_source_data: has a use for recorded transitions of the source
     """
 
     run: Callable[[Run, LearningCurve], None]
-    updates: Callable[[str | None], float]
     in_batches: bool = False
     takes_source_data: bool = True
 
@@ -102,7 +100,7 @@ def _sac_warm(run: Run, curve: LearningCurve) -> None:
 
 
 def _sac_warm_high(run: Run, curve: LearningCurve) -> None:
-    settings = {"gradient_steps": int(_rpto_updates(run.source_id())), **run.kwargs}
+    settings = {"gradient_steps": _rpto_updates(run.source_id()), **run.kwargs}
     n_critics = settings.pop("n_critics", None)
     if n_critics is None:
         model = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, **settings)
@@ -147,41 +145,26 @@ def _sysid_retrain(run: Run, curve: LearningCurve) -> None:
     curve.finish(model, run.budget)
 
 
-def _rpto_updates(env_id: str | None) -> float:
+def _rpto_updates(env_id: str | None) -> int:
+    """RPTO's updates per target step of a task."""
     return resolve_preset("default", "ensemble", env_id, ())["gradient_steps"]
-
-
-def _rpo_updates(env_id: str | None) -> float:
-    return resolve_preset("default", "real", env_id, ())["gradient_steps"]
-
-
-def _published(cls: type[MBPO], env_id: str | None) -> float:
-    return cls.published(env_id)["gradient_steps"]
-
-
-def _slbo_updates(env_id: str | None) -> float:
-    return 20 * 40 / SLBO.published(env_id)["model_train_freq"]
-
-
-def _number(updates: float) -> Callable[[str | None], float]:
-    return lambda env_id: updates
 
 
 #: All methods, by the names of the command line.
 REGISTRY: dict[str, Method] = {
-    "zero-shot": Method(_zero_shot, _number(0), takes_source_data=False),
-    "rpo": Method(partial(two_worlds, RPO), _rpo_updates),
-    "rto": Method(partial(two_worlds, RTO), _rpto_updates),
-    "rpto": Method(partial(two_worlds, RPTO), _rpto_updates),
-    "sac": Method(_sac, _number(1), takes_source_data=False),
-    "sac-warm": Method(_sac_warm, _number(1), takes_source_data=False),
-    "sac-warm-high": Method(_sac_warm_high, _rpto_updates),
-    "sac-mixed": Method(_sac_mixed, _number(1)),
-    "trpo-warm": Method(_trpo_warm, _number(1 / 2048), in_batches=True),
-    "mbpo": Method(partial(two_worlds, MBPO), partial(_published, MBPO)),
-    "slbo": Method(_slbo, _slbo_updates, in_batches=True),
-    "ptp": Method(partial(two_worlds, PTP), partial(_published, PTP)),
-    "pdml": Method(partial(two_worlds, PDML), partial(_published, PDML)),
-    "sysid-retrain": Method(_sysid_retrain, _number(0), in_batches=True, takes_source_data=False),
-    "oracle": Method(_sac_warm, _number(1), takes_source_data=False),
+    "zero-shot": Method(_zero_shot, takes_source_data=False),
+    "rpo": Method(partial(two_worlds, RPO)),
+    "rto": Method(partial(two_worlds, RTO)),
+    "rpto": Method(partial(two_worlds, RPTO)),
+    "sac": Method(_sac, takes_source_data=False),
+    "sac-warm": Method(_sac_warm, takes_source_data=False),
+    "sac-warm-high": Method(_sac_warm_high),
+    "sac-mixed": Method(_sac_mixed),
+    "trpo-warm": Method(_trpo_warm, in_batches=True),
+    "mbpo": Method(partial(two_worlds, MBPO)),
+    "slbo": Method(_slbo, in_batches=True),
+    "ptp": Method(partial(two_worlds, PTP)),
+    "pdml": Method(partial(two_worlds, PDML)),
+    "sysid-retrain": Method(_sysid_retrain, in_batches=True, takes_source_data=False),
+    "oracle": Method(_sac_warm, takes_source_data=False),
 }

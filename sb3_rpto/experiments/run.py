@@ -12,7 +12,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_rpto.experiments.baselines import fine_tuned_sac as fine_tuned_sac
 from sb3_rpto.experiments.methods import REGISTRY, MakeEnv, Run
 
 METHODS = tuple(REGISTRY)

@@ -105,9 +105,9 @@ class Likes:
 
         An odd one may have been chosen while the others were still wrong.
         """
-        count = Counter(self.kinds[e] for e in model.effects)
+        usual = Counter(self.kinds[e] for e in model.effects).most_common(1)
         for e in model.effects:
-            kind, places = count.most_common(1)[0]
+            kind, places = usual[0]
             same = [i for i in self._excited(kind) if i not in model.effects]
             other = max(same, key=lambda i: self.screening.cosine[e, i], default=e)
             if places < 2 or self.kinds[e] == kind or self.screening.cosine[e, other] < LIKE:

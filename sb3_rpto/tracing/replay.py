@@ -14,6 +14,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.buffers import DualReplayBuffer
+from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.envs.observations import (
     StateMap,
     States,
@@ -282,9 +283,7 @@ def _commands(actions: np.ndarray, env: gym.Env, findings: list[Finding]) -> np.
             f"{env_name(env)}: actions have shape (n, {actions.shape[1:]}), the model {model.nu} actuators; "
             "give an environment whose action is the command of its actuators"
         )
-    limited = model.actuator_ctrllimited.astype(bool)
-    low, high = np.where(limited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf)).T
-    return np.clip(actions.astype(float), low, high)
+    return np.clip(actions.astype(float), *command_limits(model))
 
 
 class _Repairs:

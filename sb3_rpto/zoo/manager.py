@@ -85,7 +85,7 @@ class TransferManager(ExperimentManager):
         """As the zoo's; in a file of ours, a target has the settings of its task."""
         env_name = self.env_name
         if self._shipped is not None:
-            self.env_name = type(env_name)(section(self.algo, env_name.gym_id))
+            self.env_name = type(env_name)(section(env_name.gym_id))
         try:
             return super().read_hyperparameters()
         finally:

@@ -42,8 +42,8 @@ def shipped_file(algo: str) -> Path | None:
     return path if path.is_file() else None
 
 
-def section(algo: str, env_id: str) -> str:
-    """The key of an algorithm's file that holds for an environment."""
+def section(env_id: str) -> str:
+    """The key of the algorithms' files that holds for an environment."""
     return source_of(env_id) or env_id
 
 
@@ -58,7 +58,7 @@ def shipped_settings(algo: str, env_id: str) -> dict[str, Any]:
     if path is None:
         raise ValueError(f"there are no settings for {algo!r}; there are some for {', '.join(shipped_algorithms())}")
     sections = yaml.safe_load(path.read_text(encoding="utf-8"))
-    return dict(sections.get(section(algo, env_id), sections["default"]))
+    return dict(sections.get(section(env_id), sections["default"]))
 
 
 def shipped_algorithms() -> list[str]:
