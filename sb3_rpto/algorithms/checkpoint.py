@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import inspect
 import io
-import os
 import pathlib
 import random
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import cloudpickle
@@ -27,6 +26,7 @@ from sb3_rpto.algorithms.worlds import find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.effects.names import near
 from sb3_rpto.envs.state import restore_state, save_state
+from sb3_rpto.files import write_atomically
 
 Self = TypeVar("Self", bound="Resumable")
 
@@ -294,24 +294,3 @@ def _put_back(env: VecEnv, state: dict[str, Any] | None) -> bool:
     except ValueError:
         return False
     return True
-
-
-def write_atomically(path: Any, write: Callable[[Any], None], suffix: str = "zip") -> None:
-    """Write through a temporary file beside ``path``: a killed run leaves the old file or the new one, never half.
-
-    :param path: where the file goes; ``suffix`` is added when it has none; file objects are written directly
-    :param write: writes to the path that it is given
-    """
-    if not isinstance(path, str | pathlib.Path):
-        write(path)
-        return
-    path = pathlib.Path(path)
-    if path.suffix == "":
-        path = path.with_name(f"{path.name}.{suffix}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{suffix}")
-    try:
-        write(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -53,9 +53,9 @@ def run(parsed: argparse.Namespace) -> int:
     """Trace and learn, or go on with it."""
     from sb3_rpto import RPTO
     from sb3_rpto.algorithms.arguments import constructor_names
-    from sb3_rpto.algorithms.checkpoint import write_atomically
     from sb3_rpto.commands.progress import Progress, earnings, read_rows
     from sb3_rpto.commands.runs import RunFolder, beside, load_checkpoint
+    from sb3_rpto.files import write_atomically
     from sb3_rpto.tracing import figures
 
     figures.require()

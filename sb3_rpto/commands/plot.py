@@ -48,7 +48,7 @@ def run(parsed: argparse.Namespace) -> int:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError(f"plot needs matplotlib and pandas ({error}): pip install 'sb3-rpto[experiments]'") from error
-    from sb3_rpto.algorithms.checkpoint import write_atomically
+    from sb3_rpto.files import write_atomically
 
     rows = pd.DataFrame(read_rows(parsed.results))
     panels = sorted(rows["target"].unique())

@@ -15,9 +15,9 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_rpto.algorithms.checkpoint import write_atomically
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.experiments.run import LearningCurve, MakeEnv
+from sb3_rpto.files import write_text
 
 #: In a checkpoint: the class of its model, and the rows until then.
 CURVE = "curve.json"
@@ -109,8 +109,7 @@ class RunFolder:
 
     @staticmethod
     def _write_json(path: Path, content: Any) -> None:
-        text = json.dumps(content, indent=1)
-        write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"), suffix="json")
+        write_text(path, json.dumps(content, indent=1))
 
 
 def beside(folder: Path, file: str | None) -> str | None:

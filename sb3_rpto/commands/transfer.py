@@ -65,9 +65,9 @@ def add(commands: Any) -> None:
 
 def run(parsed: argparse.Namespace) -> int:
     """Transfer, or go on with it."""
-    from sb3_rpto.algorithms.checkpoint import write_atomically
     from sb3_rpto.commands.runs import RunFolder, SavedCurve, beside
     from sb3_rpto.experiments.methods import REGISTRY, Run
+    from sb3_rpto.files import write_atomically
     from sb3_rpto.zoo.settings import ALGORITHMS, shipped_settings
 
     options.check_positive(parsed, "steps", "every", "episodes")

@@ -12,8 +12,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_rpto.algorithms.checkpoint import write_atomically
 from sb3_rpto.commands.policies import Policy
+from sb3_rpto.files import write_atomically
 
 SUFFIXES = (".mp4", ".gif")
 #: Pictures a second at most; a GIF has no more than 50.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from sb3_rpto.effects.stance import StandingEnv, nominal_heights
 from sb3_rpto.effects.units import units_at
 from sb3_rpto.effects.world import LiveWorld
 from sb3_rpto.effects.wrapper import CorrectedEnv, active, own
+from sb3_rpto.files import write_bytes
 
 FORMAT = 1
 #: What reading a file raises that holds other things than :func:`save_corrected` writes.
@@ -128,9 +128,9 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
     folder = Path(folder)
     (folder / "assets" if assets else folder).mkdir(parents=True, exist_ok=True)
     for name, content in assets.items():
-        _write(folder / name, content)
-    _write(folder / "model.xml", text.encode())
-    _write(folder / "effects.json", json.dumps(stored, indent=1).encode())
+        write_bytes(folder / name, content)
+    write_bytes(folder / "model.xml", text.encode())
+    write_bytes(folder / "effects.json", json.dumps(stored, indent=1).encode())
 
 
 def overwrites(folder: str | os.PathLike[str], source: ModelSource) -> bool:
@@ -222,18 +222,3 @@ def _rebuild(entry: Mapping[str, Any], model: mujoco.MjModel, nominal: Mapping[s
             "its class, decorated with @sb3_rpto.effects.register, before loading"
         )
     return from_json(entry)
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Replace a file in one go."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-        temporary = Path(file.name)
-        try:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        except BaseException:
-            temporary.unlink()
-            raise
-    temporary.chmod(0o644)
-    temporary.replace(path)

@@ -25,10 +25,10 @@ from sb3_rpto.experiments.closed_loop import (
     shifted,
     source_agent,
 )
+from sb3_rpto.files import write_text
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.columns import columns_of
 from sb3_rpto.tracing.contacts import contact_changes
-from sb3_rpto.tracing.report import write_atomically
 
 #: A noisy log: runs, steps of the policy in each, and the longest time between two samples in s.
 RUNS, STEPS, SAMPLED = 10, 100, 0.01
@@ -101,7 +101,7 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
         began = time.perf_counter()
         report = trace(source, data, TASKS[job.task].declared, seed=job.seed, horizon=horizon, threads=1)
         row = {**asdict(job), **judged(job, report), "seconds": round(time.perf_counter() - began, 1)}
-        write_atomically(path, json.dumps(row, indent=1) + "\n")
+        write_text(path, json.dumps(row, indent=1) + "\n")
     return {**asdict(job), **json.loads(path.read_text())}
 
 

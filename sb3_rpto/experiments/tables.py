@@ -28,7 +28,7 @@ from sb3_rpto.experiments.report import (
     overall,
     scored,
 )
-from sb3_rpto.tracing.report import write_atomically
+from sb3_rpto.files import write_text
 
 SHARE_WORDS = f"{100 * SHARE:.0f} %"
 NAME = "sb3-rpto benchmark report"
@@ -138,13 +138,13 @@ def write(folder: str | os.PathLike[str]) -> str:
     if study.rows["factors"].map(len).any():
         tables["effects"] = effects(study.rows, study.manifest["interactions"])
     for name, table in tables.items():
-        write_atomically(out / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
+        write_text(out / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
     counted = {"runs": _runs(study.rows), "failed": study.failed, "left_out": study.left_out, "commits": study.commits}
     everything = {"manifest": study.manifest, **counted, **{n: t.to_dict("records") for n, t in tables.items()}}
-    write_atomically(out / "report.json", json.dumps(plain(everything), indent=1, allow_nan=False) + "\n")
+    write_text(out / "report.json", json.dumps(plain(everything), indent=1, allow_nan=False) + "\n")
     plots.learning_curves(lines, references, study.labels, study.ours, out / "curves.png")
     text = markdown(study, tables)
-    write_atomically(out / "report.md", text)
+    write_text(out / "report.md", text)
     return text
 
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.planting import SYSTEMS, generate
+from sb3_rpto.files import write_text
 from sb3_rpto.tracing.calibrate import LEVEL, strongest
 from sb3_rpto.tracing.prepare import prepare
-from sb3_rpto.tracing.report import write_atomically
 from sb3_rpto.tracing.screen import screen
 from sb3_rpto.tracing.search import aligned, fit_declared, worth_fitting
 from sb3_rpto.tracing.select import THRESHOLD
@@ -65,7 +65,7 @@ def measure(out: str | os.PathLike[str], sets: int) -> str:
             "versions": provenance.versions(),
         }
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, json.dumps(summary | made | {"sets": rows}, indent=1) + "\n")
+        write_text(path, json.dumps(summary | made | {"sets": rows}, indent=1) + "\n")
     ts = [row["t"] for row in rows[:sets]]
     above = sum(t > THRESHOLD for t in ts)
     least = np.quantile(ts, LEVEL)

@@ -14,6 +14,7 @@ import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.carry import carried_by, save_corrected
+from sb3_rpto.files import write_text
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import Adequacy
 from sb3_rpto.tracing.checks import Finding, grouped
@@ -367,8 +368,8 @@ class Report:
             # After a long trace, a file that is missing must not lose what was found.
             if not isinstance(self.source, mujoco.MjModel):
                 out.mkdir(parents=True, exist_ok=True)
-                write_atomically(out / "report.json", data + "\n")
-                write_atomically(out / "report.html", page)
+                write_text(out / "report.json", data + "\n")
+                write_text(out / "report.html", page)
         return out
 
 
@@ -385,16 +386,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, str | int) else str(value)
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -14,7 +14,7 @@ from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.effects.units import units_at
 from sb3_rpto.tracing import Report, wording
-from sb3_rpto.tracing.report import Traced, write_atomically
+from sb3_rpto.tracing.report import Traced
 
 SLIDE = """<mujoco><worldbody><body name="cart">
 <joint name="rail" type="slide"/><geom size="0.1" mass="1"/>
@@ -115,15 +115,6 @@ def test_a_model_whose_mjcf_is_unknown_is_refused_and_nothing_written(report: Re
     with pytest.raises(ValueError, match="give its file"):
         compiled.save(tmp_path / "out")
     assert not (tmp_path / "out" / "report.json").exists()
-
-
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
-    path = tmp_path / "report.json"
-    write_atomically(path, "old")
-    with pytest.raises(UnicodeEncodeError):
-        write_atomically(path, "\ud800")
-    assert path.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["report.json"]
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from sb3_rpto.experiments.speed import cases
 from sb3_rpto.experiments.speed.cases import Case
 from sb3_rpto.experiments.speed.memory import MAKERS, peak_memory
 from sb3_rpto.experiments.speed.timing import flops, interleaved, products
-from sb3_rpto.tracing.report import write_atomically
+from sb3_rpto.files import write_text
 
 __all__ = ["add_arguments", "main", "run_benchmark"]
 
@@ -69,8 +69,8 @@ def run_benchmark(out: str, scale: str, threads: Sequence[int], device: str) -> 
 
     def keep(part: str, row: Row) -> None:
         found[part].append(row)
-        write_atomically(Path(out) / "speed.json", json.dumps(found, indent=1) + "\n")
-        write_atomically(Path(out) / "speed.md", table(found["cases"], found["growth"]))
+        write_text(Path(out) / "speed.json", json.dumps(found, indent=1) + "\n")
+        write_text(Path(out) / "speed.md", table(found["cases"], found["growth"]))
 
     try:
         for count in threads:

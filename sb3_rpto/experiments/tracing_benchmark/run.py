@@ -23,10 +23,10 @@ from sb3_rpto.effects import Effect
 from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.tracing_benchmark.design import Case, design
 from sb3_rpto.experiments.tracing_benchmark.truth import Set, make
+from sb3_rpto.files import write_text
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors
 from sb3_rpto.tracing.identify import Problem
-from sb3_rpto.tracing.report import write_atomically
 from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.windows import cut
 from sb3_rpto.version import __version__
@@ -116,7 +116,7 @@ def work(case: Case, folder: Path, commit: str | None) -> Result:
     except Exception:
         result["error"] = traceback.format_exc(limit=-3)
         result["seconds"] = time.process_time() - start
-    write_atomically(folder / f"{case.id}.json", json.dumps(provenance.plain(result), indent=1, allow_nan=False) + "\n")
+    write_text(folder / f"{case.id}.json", json.dumps(provenance.plain(result), indent=1, allow_nan=False) + "\n")
     return result
 
 

@@ -17,7 +17,7 @@ from sb3_rpto.experiments.planting import SYSTEMS
 from sb3_rpto.experiments.tracing_benchmark.design import GROUPS, HIGH, LOW, Case, fingerprint
 from sb3_rpto.experiments.tracing_benchmark.score import APPLY, MEASURES, Result, Row, Share, score, share
 from sb3_rpto.experiments.tracing_benchmark.truth import TWINS
-from sb3_rpto.tracing.report import write_atomically
+from sb3_rpto.files import write_text
 
 MINUTES = 3.0
 """A set of a machine with one or two joints is to be traced within this time."""
@@ -205,7 +205,7 @@ def write(out: str | os.PathLike[str], results: Sequence[Result], cases: Sequenc
         "manifest.json": json.dumps(manifest(results, cases, command), indent=1) + "\n",
     }
     for name, content in files.items():
-        write_atomically(Path(out) / name, content)
+        write_text(Path(out) / name, content)
     return text
 
 
