@@ -259,17 +259,12 @@ def _check_counts(**values: Any) -> None:
             raise ValueError(f"{name} must be a positive integer, got {value!r}")
 
 
-def check_something_to_fit(
-    config: dict[str, Any], close_loop: bool | Sequence[str], traces_log: bool, passed: Collection[str]
-) -> None:
-    """Refuse a physical model without parameters, what it has no use for, and a loop that cannot be closed.
+def check_kinds(close_loop: bool | Sequence[str]) -> None:
+    """Refuse kinds of effects that no trace can look for.
 
-    :param config: of the dynamics
     :param close_loop: whether, or the kinds of effects to look for
-    :param traces_log: measurements stand in for the target
-    :param passed: names of the arguments that the user passed
-    :raises ValueError: with the remedy
     :raises TypeError: for a single kind, and for what is no kind
+    :raises ValueError: for a kind that is not in the library
     """
     if isinstance(close_loop, str):
         raise TypeError(f"close_loop must be True or a list of kinds, not a string; write [{close_loop!r}]")
@@ -283,8 +278,20 @@ def check_something_to_fit(
             )
         if kind not in LIBRARY:
             raise ValueError(f"close_loop: no effect {kind!r} is registered; {near(kind, LIBRARY)}")
-    mujoco = config["backend"] == "physical" and is_mujoco(config)
-    if close_loop is not False and not mujoco:
+
+
+def check_backend(
+    config: dict[str, Any], close_loop: bool | Sequence[str], traces_log: bool, passed: Collection[str]
+) -> None:
+    """Refuse what a backend has no use for, or would lose.
+
+    :param config: of the dynamics
+    :param close_loop: whether, or the kinds of effects to look for
+    :param traces_log: measurements stand in for the target
+    :param passed: names of the arguments that the user passed
+    :raises ValueError: with the remedy
+    """
+    if close_loop is not False and not (config["backend"] == "physical" and is_mujoco(config)):
         raise ValueError(
             "close_loop=True traces what a MuJoCo simulator lacks: pass dynamics='physical' and a gymnasium MuJoCo env"
         )
@@ -302,10 +309,6 @@ def check_something_to_fit(
         raise ValueError(
             "rollout_start is for one-step branches; dynamics='physical' simulates whole episodes: leave it out"
         )
-    if mujoco and (close_loop is not False or traces_log):  # a trace would refuse them after many target steps
-        model = config["model"]
-        compiled = model.compile() if isinstance(model, PlainModel) else model
-        given(compiled, config.get("declared", ()), [from_json(stored) for stored in config.get("effects", ())])
     residual = config["backend"] == "residual"
     late = [e.label for e in map(from_json, config.get("effects", ())) if e.remembers] if residual else []
     if late:
@@ -313,7 +316,23 @@ def check_something_to_fit(
             f"dynamics='residual' answers each step from its observation alone, where {', '.join(late)} would be lost; "
             "pass dynamics='physical', which simulates whole episodes"
         )
-    if mujoco and not close_loop and not config.get("declared") and not config.get("effects"):
+
+
+def check_something_to_fit(config: dict[str, Any], close_loop: bool | Sequence[str], traces_log: bool) -> None:
+    """Refuse a MuJoCo simulator without parameters, and those that a trace would refuse after many target steps.
+
+    :param config: of the dynamics
+    :param close_loop: whether, or the kinds of effects to look for
+    :param traces_log: measurements stand in for the target
+    :raises ValueError: with the remedy
+    """
+    if config["backend"] != "physical" or not is_mujoco(config):
+        return
+    if close_loop is not False or traces_log:
+        model = config["model"]
+        compiled = model.compile() if isinstance(model, PlainModel) else model
+        given(compiled, config.get("declared", ()), [from_json(stored) for stored in config.get("effects", ())])
+    if not close_loop and not config.get("declared") and not config.get("effects"):
         raise ValueError(
             "dynamics='physical' has nothing to fit: pass declared=[...], names of the model's numbers such as "
             "'hinge.damping' or '*.mass', or close_loop=True"

@@ -225,7 +225,9 @@ class TransferAlgorithm(Looping):
                     self.dynamics_backend, self.env, self.dynamics_kwargs, self.declared
                 )
                 traces_log = self.measured is not None
-                arguments.check_something_to_fit(self.dynamics_config, self.close_loop, traces_log, self._passed)
+                arguments.check_kinds(self.close_loop)
+                arguments.check_backend(self.dynamics_config, self.close_loop, traces_log, self._passed)
+                arguments.check_something_to_fit(self.dynamics_config, self.close_loop, traces_log)
                 arguments.check_rules(self.dynamics_kwargs, self.observation_space, self.action_space)
             self._setup_model()
             if target_env is not None:

@@ -70,6 +70,11 @@ class Measurements:
         return self.exact or self.noise is not None
 
     @property
+    def step(self) -> float:
+        """Median time between two samples, s."""
+        return float(np.median(np.concatenate([np.diff(episode.time) for episode in self.episodes])))
+
+    @property
     def joints(self) -> tuple[str, ...]:
         """Joint names, in the order of the columns."""
         return tuple(dict.fromkeys(map(joint_of, self.columns.qpos)))

@@ -53,7 +53,7 @@ def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
     """
     columns = data.columns
     positions = list(range(len(columns.qpos)))
-    step = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
+    step = data.step
     if columns.ctrl:
         what = f"with all commands one sample ({step:.3g} s) earlier"
         remedy = "each row seems to hold the command of the row before; shift the ctrl columns up a row"

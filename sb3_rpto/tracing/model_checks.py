@@ -183,7 +183,7 @@ def _sampling(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     if not data.episodes:
         return []
     found = []
-    step, timestep = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes]))), model.opt.timestep
+    step, timestep = data.step, model.opt.timestep
     whole = max(1, round(step / timestep)) * timestep
     if abs(step - whole) > 0.01 * step:
         message = (
@@ -274,7 +274,7 @@ def _responses(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
         lag = int(np.argmax(strength))
         right = np.mean([c[0][lag] > 0 and 1 / _SLOPE <= c[1][lag] <= _SLOPE for c in correlations.values()])
         if lag > LAG and right > 0.5 and strength[lag] >= max(_CERTAIN, strength[0] + _GAIN):
-            step = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
+            step = data.step
             message = (
                 f"the motion follows about {lag} samples ({lag * step:.3g} s) late: a delay or lag in the actuator, or "
                 "channels that were not recorded at the same time"

@@ -36,7 +36,7 @@ def may_be_exact(data: Measurements) -> bool:
     Where commands change from one slow sample to the next the motion between them is not smooth. All velocities are to
     be known, as predictions would begin at the samples themselves.
     """
-    step = np.median(np.concatenate([np.diff(episode.time) for episode in data.episodes]))
+    step = data.step
     return not (data.whole_states or data.columns.missing or data.unobserved) and bool(step >= SLOW)
 
 

@@ -139,7 +139,7 @@ def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco
     """
     copy = model.__copy__()
     if not (data.exact or data.simulated):
-        longest = min(LONGEST, float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes]))))
+        longest = min(LONGEST, data.step)
         copy.opt.timestep = model.opt.timestep / math.ceil(model.opt.timestep / longest - 1e-9)
         if fine and stiff(copy):
             copy.opt.integrator = int(_IMPLICIT.get(model.opt.integrator, _FAST))
@@ -210,7 +210,7 @@ def cut(
     :param overlap: share of a window that the next one covers too, in [0, 1)
     :raises ValueError: no episode is as long as a window
     """
-    step = float(np.median(np.concatenate([np.diff(e.time) for e in data.episodes])))
+    step = data.step
     if horizon < 1.99 * step:
         raise ValueError(f"a window of {horizon:g} s holds fewer than two steps of {step:.4g} s; raise horizon")
     starts = []
