@@ -276,3 +276,26 @@ def encoder_zeros(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Findin
         )
         found.append(Finding("encoder zero", effect.label, message))
     return found
+
+
+def too_short(errors: list[HorizonError], data: Measurements) -> list[Finding]:
+    """That no run is long enough to tell an error."""
+    if errors:
+        return []
+    length = 1e3 * max((float(np.ptp(e.time)) for e in data.episodes), default=0.0)
+    message = f"no error on unseen runs: the longest stretch of theirs has {length:.3g} ms; set longer runs apart"
+    return [Finding("split", "test runs", message)]
+
+
+def unstable(problem: Problem, before: np.ndarray, after: np.ndarray) -> list[Finding]:
+    """Windows in which a model became unstable, with the values (p,) of the declared and of the corrected one."""
+    found = []
+    for which, values, remedy in (
+        ("fitted declared", before, "its errors before say no more; give bounds to what you declare"),
+        ("corrected", after, "lower its timestep"),
+    ):
+        count = problem.unstable(values)
+        if count:
+            message = f"in {count} of {len(problem.windows)} the {which} model became unstable; {remedy}"
+            found.append(Finding("unstable", "fitted windows", message))
+    return found

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -22,15 +22,15 @@ from sb3_rpto.tracing.cautions import (
     own_steps,
     soft_instead,
     strays,
+    too_short,
     undetermined,
+    unstable,
 )
 from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.concentrate import NOTHING
-from sb3_rpto.tracing.evaluate import horizon_errors, noise_floor
+from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Fit, Problem
-from sb3_rpto.tracing.intervals import half_widths, not_told_apart
+from sb3_rpto.tracing.intervals import FINAL, refit
 from sb3_rpto.tracing.likes import Likes
-from sb3_rpto.tracing.loss import Loss
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.misread import misread
 from sb3_rpto.tracing.missing import missing_forces
@@ -42,15 +42,13 @@ from sb3_rpto.tracing.residuals import learnable_share, summary
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.search import Found, find, worth_a_look
 from sb3_rpto.tracing.select import Selection, Selector
-from sb3_rpto.tracing.zeros import homed, settled, zeros_by_run
+from sb3_rpto.tracing.zeros import Zeros, homed, settled, zeros_by_run
 
 #: Verdicts that leave nothing to look for.
 SETTLED = ("complete", "explained")
 _NEVER = "beside what is kept it lowers the error of unseen windows by nothing clear"
 #: Another effect's typical error that is still as good, as a multiple.
 AS_WELL = 1.1
-#: Most iterations of the last fits: where two parameters do nearly the same, a descent goes slowly along their valley.
-FINAL = 40
 
 
 def trace(
@@ -104,47 +102,11 @@ def trace(
         at, finer = partial(on.selectors, say=say), partial(on.finer, say=say)
         return find(at, finer, on.length, on.longer, seed, calibrate)
 
-    set_up = prepared(data, simulated)
-    found = search(set_up)
-    again = _of_own_steps(set_up, found, declared, threads)
-    if again is not None:
-        set_up = prepared(data, True)
-        found = search(set_up)
-        set_up.findings.append(again)
-    if not _explains(found) and may_be_exact(data):
-        exact = prepared(replace(data, exact=True), simulated)
-        then = search(exact)
-        if _explains(then):
-            set_up, found = exact, then
-            message = "from the model's own steps in time, without noise, as shows with what was found: searched again"
-            set_up.findings.append(Finding("simulated", "fitted runs", message))
-    first = found
-    zeros = zeros_by_run(set_up, found, _explains(found), say, seed)
-    if zeros is not None:
-        without = homed(set_up, zeros)
-        without, refined, then = settled(without, zeros, search(without), say, seed)
-        zeros = refined if then.after.adequate or then.after.ratio < found.after.ratio else None
-    if zeros is not None:
-        set_up, found = without, then
-        set_up.findings.append(zeros.finding())
-    named = bool(found.selection.model.effects) or zeros is not None
-    no_better = not found.after.ratio < first.before.ratio
-    if no_better and judge(first.before, found.after, named) == "unexplained":
-        found = replace(found, selection=Selection(found.base), after=found.before)  # it is no hint either
+    searched = _search(prepared, search, data, simulated, declared, threads, seed, say)
+    set_up, found, first, zeros = searched.set_up, searched.found, searched.first, searched.zeros
     sigma, fitted = set_up.sigma, set_up.fitted
     selector, selection = found.on.fine, found.selection
-    simulation, findings = selector.simulation, set_up.findings
-    step, usual = (1e3 * float(s.model.opt.timestep) for s in (simulation, set_up.fine))
-    if step < usual:
-        message = (
-            f"judged with steps of {step:g} ms: longer ones err by a good part of what is left (dry friction and "
-            "contacts are kinks); the corrected simulator errs less with a smaller timestep, too"
-        )
-        findings.append(Finding("time step", "model", message))
-    if selector.select is None:
-        count = len(selector.train.windows)
-        message = f"selected on {count} windows of the training runs by cross-validation over blocks"
-        findings.append(Finding("split", "training runs", message))
+    simulation = selector.simulation
 
     say(0.85, "fitting the final model")
     problem = selector.every_window()
@@ -157,48 +119,31 @@ def trace(
     data = set_up.test if set_up.test.episodes else fitted
     errors_before = horizon_errors(simulation, before.values, data, sigma, seed)
     errors_after = horizon_errors(simulation, final, data, sigma, seed)
-    if not errors_after:
-        length = 1e3 * max((float(np.ptp(e.time)) for e in data.episodes), default=0.0)
-        message = f"no error on unseen runs: the longest stretch of theirs has {length:.3g} ms; set longer runs apart"
-        findings.append(Finding("split", "test runs", message))
     # What an equality constraint transmits is not known from the motion.
     tied = simulation.model.neq > 0
     residuals_before = [] if tied else missing_forces(simulation, before.values, data)
     residuals_after = [] if tied else missing_forces(simulation, final, data)
     unknown = np.full(simulation.model.nv, np.nan)  # where all runs are too short to differentiate
     rounding = data.exact and found.after.adequate  # is all that is left
-    verdict = judge(first.before, found.after, named)
     floor = noise_floor(simulation, final, data, sigma, seed)
-    if verdict in SETTLED:
-        findings += missed(simulation, final, set_up.test, sigma, seed)
-        findings += (
-            above_noise(errors_after, floor, found.after.ratio, selector.horizon) if set_up.test.episodes else []
-        )
-        findings += own_steps(set_up.nominal, simulation, final, fitted, sigma, selector.horizon)
-    else:
-        findings += doubts(set_up.nominal, fitted) + misread(found, set_up)
-        findings += no_nearer(errors_before, errors_after) if selection.model.effects else []
-        free = selector.free(selection.model.effects)
-        findings += finer_steps(problem, final, free, fitted, selector.horizon)
-        findings += soft_instead(problem, final, selection.model.effects) if not fitted.simulated else []
-    findings += undetermined(problem, final, intervals) + at_bounds(problem, final)
-    findings += strays(selector, final, set_up, seed)
     kept = _kept(selection, simulation, final, intervals, selector.limit(selection.model), seed)
-    if verdict in SETTLED and found.screening is not None:
+    if searched.verdict in SETTLED and found.screening is not None:
         likes = Likes(selector, found.screening)
         fit = problem.score(final)
         kept = [replace(t, stand_ins=_stand_ins(t, selection, likes, problem, fit, intervals)) for t in kept]
-    findings += encoder_zeros(simulation.model, [traced.effect for traced in kept])
-    for which, values, remedy in (
-        ("fitted declared", before.values, "its errors before say no more; give bounds to what you declare"),
-        ("corrected", final, "lower its timestep"),
-    ):
-        unstable = problem.unstable(values)
-        if unstable:
-            message = f"in {unstable} of {len(problem.windows)} the {which} model became unstable; {remedy}"
-            findings.append(Finding("unstable", "fitted windows", message))
+    findings = [
+        *set_up.findings,
+        *_of_the_search(searched),
+        *too_short(errors_after, data),
+        *_of_the_verdict(searched, problem, final, (errors_before, errors_after, floor), seed),
+        *undetermined(problem, final, intervals),
+        *at_bounds(problem, final),
+        *strays(selector, final, set_up, seed),
+        *encoder_zeros(simulation.model, [traced.effect for traced in kept]),
+        *unstable(problem, before.values, final),
+    ]
     return Report(
-        verdict=verdict,
+        verdict=searched.verdict,
         declared=_declared(simulation, final, intervals),
         effects=kept,
         candidates=_fates(selector, found.screening, selection),
@@ -231,6 +176,112 @@ def trace(
         data=data,
         sigma=sigma,
     )
+
+
+@dataclass(frozen=True)
+class _Searched:
+    """What a search ended with.
+
+    :param set_up: the recordings, as they were read at last
+    :param found: what was found in them
+    :param first: the same before zeros of single runs were taken off
+    :param zeros: encoder zeros that differ by run; None where none do
+    :param verdict: see :func:`judge`
+    """
+
+    set_up: SetUp
+    found: Found
+    first: Found
+    zeros: Zeros | None
+    verdict: str
+
+
+def _search(
+    prepared: Callable[[Measurements, bool], SetUp],
+    search: Callable[[SetUp], Found],
+    data: Measurements,
+    simulated: bool,
+    declared: Sequence[str],
+    threads: int,
+    seed: int,
+    say: Progress,
+) -> _Searched:
+    """Search, and once more where what was found tells that the recordings are of another kind than they looked."""
+    set_up = prepared(data, simulated)
+    found = search(set_up)
+    again = _of_own_steps(set_up, found, declared, threads)
+    if again is not None:
+        set_up = prepared(data, True)
+        found = search(set_up)
+        set_up.findings.append(again)
+    if not _explains(found) and may_be_exact(data):
+        exact = prepared(replace(data, exact=True), simulated)
+        then = search(exact)
+        if _explains(then):
+            set_up, found = exact, then
+            message = "from the model's own steps in time, without noise, as shows with what was found: searched again"
+            set_up.findings.append(Finding("simulated", "fitted runs", message))
+    first = found
+    zeros = zeros_by_run(set_up, found, _explains(found), say, seed)
+    if zeros is not None:
+        without = homed(set_up, zeros)
+        without, refined, then = settled(without, zeros, search(without), say, seed)
+        zeros = refined if then.after.adequate or then.after.ratio < found.after.ratio else None
+    if zeros is not None:
+        set_up, found = without, then
+        set_up.findings.append(zeros.finding())
+    verdict = judge(first.before, found.after, bool(found.selection.model.effects) or zeros is not None)
+    if verdict == "unexplained" and not found.after.ratio < first.before.ratio:
+        found = replace(found, selection=Selection(found.base), after=found.before)  # it is no hint either
+    return _Searched(set_up, found, first, zeros, verdict)
+
+
+def _of_the_search(searched: _Searched) -> list[Finding]:
+    """How it was searched, where that is not as usual."""
+    selector, found = searched.found.on.fine, []
+    step, usual = (1e3 * float(s.model.opt.timestep) for s in (selector.simulation, searched.set_up.fine))
+    if step < usual:
+        message = (
+            f"judged with steps of {step:g} ms: longer ones err by a good part of what is left (dry friction and "
+            "contacts are kinks); the corrected simulator errs less with a smaller timestep, too"
+        )
+        found.append(Finding("time step", "model", message))
+    if selector.select is None:
+        count = len(selector.train.windows)
+        message = f"selected on {count} windows of the training runs by cross-validation over blocks"
+        found.append(Finding("split", "training runs", message))
+    return found
+
+
+def _of_the_verdict(
+    searched: _Searched,
+    problem: Problem,
+    values: np.ndarray,
+    errors: tuple[list[HorizonError], list[HorizonError], list[HorizonError]],
+    seed: int,
+) -> list[Finding]:
+    """What a settled verdict may have missed, or what speaks for another reason where it is not settled.
+
+    :param values: of the corrected model, (p,)
+    :param errors: before and after, and what noise leaves
+    """
+    set_up, found = searched.set_up, searched.found
+    simulation, sigma, fitted = problem.simulation, set_up.sigma, set_up.fitted
+    (before, after, floor), horizon = errors, found.on.fine.horizon
+    if searched.verdict in SETTLED:
+        return [
+            *missed(simulation, values, set_up.test, sigma, seed),
+            *(above_noise(after, floor, found.after.ratio, horizon) if set_up.test.episodes else []),
+            *own_steps(set_up.nominal, simulation, values, fitted, sigma, horizon),
+        ]
+    named = found.selection.model.effects
+    return [
+        *doubts(set_up.nominal, fitted),
+        *misread(found, set_up),
+        *(no_nearer(before, after) if named else []),
+        *finer_steps(problem, values, found.on.fine.free(named), fitted, horizon),
+        *(soft_instead(problem, values, named) if not fitted.simulated else []),
+    ]
 
 
 def _explains(found: Found) -> bool:
@@ -266,38 +317,6 @@ def _steady(progress: Progress | None) -> Progress:
             progress(reached, what)
 
     return say
-
-
-def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Fit on train and select together.
-
-    Of what was given and only shows together, the last one stays what it was.
-
-    :return: all parameters (p,), and the bounds of their 95 % intervals (2, p), NaN where nothing was fitted, where
-        only several together are told, and where nothing shows in any window, which is what it was
-    """
-    joined = problem.windows
-    free = Selector(problem, problem, 0.0, lambda share, what: None).free(selection.model.effects)
-    fit = problem.fit(selection.model.fit.values, free, iterations=FINAL, crude=0.0)
-    alike, held = not_told_apart(problem, fit, free)
-    if len(held):
-        begin = fit.values.copy()
-        begin[held] = problem.null[held]
-        free = np.setdiff1d(free, held)
-        fit = problem.fit(begin, free, iterations=FINAL, crude=0.0)
-    values, intervals = fit.values.copy(), np.full((2, len(fit.values)), np.nan)
-    if len(free):
-        linear = problem.linear(fit, free)
-        curvature = np.einsum("wff->f", linear.normal)
-        hidden = free[curvature <= NOTHING * curvature.max()]
-        values[hidden] = problem.null[hidden]
-        r = problem.residuals(np.tile(fit.values, (len(joined), 1)), fit.starts, np.arange(len(joined)))
-        r = r[np.repeat(joined.usable, joined.measured.shape[2], axis=1)]
-        half = half_widths(linear, joined.block) * problem.size[free] / Loss.of(r).curvature(r)
-        intervals[:, free] = fit.values[free] + np.array([-1, 1])[:, None] * half
-        intervals = np.clip(intervals, problem.lower, problem.upper)
-        intervals[:, hidden] = intervals[:, alike] = np.nan
-    return values, intervals
 
 
 def judge(before: Adequacy, after: Adequacy, named: bool) -> str:
