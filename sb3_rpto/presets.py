@@ -35,7 +35,7 @@ def resolve_preset(preset: str, backend: str, env_id: str | None, passed: Collec
         raise ValueError(f"preset={preset!r} does not exist; choose one of {preset_names()}")
     sections = yaml.safe_load((_FOLDER / f"{preset}.yml").read_text(encoding="utf-8"))
     values: dict[str, Any] = {}
-    of_task = sections.get(_bare_name(env_id), {})
+    of_task = sections.get(bare_name(env_id), {})
     everywhere = {name: value for name, value in of_task.items() if name not in sections}
     for section in (sections["any"], sections.get(backend, {}), everywhere, of_task.get(backend, {})):
         for name, value in section.items():
@@ -45,6 +45,6 @@ def resolve_preset(preset: str, backend: str, env_id: str | None, passed: Collec
     return {name: value for name, value in values.items() if name not in passed}
 
 
-def _bare_name(env_id: str | None) -> str:
+def bare_name(env_id: str | None) -> str:
     """``"rpto/Ant-v0"`` and ``"module:Ant-v5"`` -> ``"Ant"``."""
     return re.sub(r"-v\d+$", "", re.split(r"[:/]", env_id or "")[-1])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
@@ -10,6 +9,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.envs.rules import env_id
+from sb3_rpto.presets import bare_name
 
 #: Arguments of RPTO that have no meaning where the model is fitted without weights and nothing is declared.
 UNUSED = frozenset({"preset", "dynamics", "declared", "close_loop", "retrain_steps", "weighting", "weight_floor"})
@@ -53,8 +53,7 @@ class MBPO(TransferAlgorithm):
 
         :param task_id: "HalfCheetah-v5" and "rpto/HalfCheetah-v0" are the same task; None: no task in particular
         """
-        task = re.sub(r"^.*[:/]|-v\d+$", "", task_id or "")
-        return {**cls.NUMBERS, **cls.NUMBERS_OF_TASKS.get(task, {})}
+        return {**cls.NUMBERS, **cls.NUMBERS_OF_TASKS.get(bare_name(task_id), {})}
 
     def _apply_preset(self) -> None:
         passed = self._passed - ({"source_steps"} if self.source_steps == "auto" else set())

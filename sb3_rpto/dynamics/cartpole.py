@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -15,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
+from sb3_rpto.effects.names import near
 from sb3_rpto.envs.cartpole import CartPoleParameters, cartpole_reward, cartpole_step, cartpole_termination
 from sb3_rpto.envs.rules import changing_wrappers
 
@@ -323,7 +323,7 @@ def _complete(constants: Mapping[str, float]) -> dict[str, float]:
     known = list(asdict(CartPoleParameters()))
     for name in constants:
         if name not in known:
-            raise ValueError(f"constants has unknown {name!r}{_suggestion(name, known)}")
+            raise ValueError(f"constants has unknown {name!r}; {near(name, known)}")
     return {name: float(value) for name, value in asdict(CartPoleParameters(**constants)).items()}
 
 
@@ -334,7 +334,7 @@ def _checked_names(declared: Sequence[str]) -> list[str]:
         )
     for name in declared:
         if name not in DECLARABLE:
-            raise ValueError(f"declared has unknown constant {name!r}{_suggestion(name, list(DECLARABLE))}")
+            raise ValueError(f"declared has unknown constant {name!r}; {near(name, list(DECLARABLE))}")
     return list(declared)
 
 
@@ -343,7 +343,7 @@ def _checked_bounds(
 ) -> dict[str, tuple[float, float]]:
     for name in given:
         if name not in declared:
-            raise ValueError(f"bounds has {name!r}, which is not declared{_suggestion(name, declared)}")
+            raise ValueError(f"bounds has {name!r}, which is not declared; {near(name, declared)}")
     bounds = {}
     for name in declared:
         value = nominal[name]
@@ -373,8 +373,3 @@ def _checked_data(data: Transitions, weights: th.Tensor | None) -> tuple[Transit
         if not getattr(data, name).isfinite().all():
             raise ValueError(f"data.{name} must be finite; drop such transitions or give them weight 0")
     return data, weights / weights.sum()
-
-
-def _suggestion(name: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(str(name), known)
-    return f"; did you mean {' or '.join(near)}?" if near else f"; choose from {', '.join(known)}"

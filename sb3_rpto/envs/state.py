@@ -19,6 +19,8 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
+from sb3_rpto.envs.observations import layers
+
 # What changes in each layer after it is made. Clocks are left out: they do not influence the course of a run.
 _WRAPPERS: dict[type[gym.Wrapper], tuple[str, ...]] = {
     wrappers.TimeLimit: ("_elapsed_steps",),
@@ -67,14 +69,14 @@ def save_state(env: VecEnv) -> dict[str, Any] | None:
     :return: plain data that pickles, or None when any layer is unknown
     """
     try:
-        layers = []
+        kept = []
         while isinstance(env, VecEnvWrapper):
-            layers.append(_attributes(env, _VEC_WRAPPERS.get(type(env))))
+            kept.append(_attributes(env, _VEC_WRAPPERS.get(type(env))))
             env = env.venv
         if type(env) is not DummyVecEnv:
             return None
         return {
-            "vec_wrappers": layers,
+            "vec_wrappers": kept,
             "buffers": _attributes(env, _VECTORISED),
             "envs": [_save_env(member) for member in env.envs],
         }
@@ -98,10 +100,10 @@ def restore_state(env: VecEnv, state: dict[str, Any]) -> None:
     _require(len(vec_layers), len(state["vec_wrappers"]), "VecEnv wrappers")
     _require(len(members), len(state["envs"]), "environments in a DummyVecEnv")
     for member, saved in zip(members, state["envs"]):
-        layers = _layers(member)
-        _require([_name(layer) for layer in layers], [layer["class"] for layer in saved["layers"]], "layers")
-        plan += zip(layers, saved["layers"])
-        _require(_kind(layers[-1]), saved["kind"], "kind of simulation")
+        around = layers(member)
+        _require([_name(layer) for layer in around], [layer["class"] for layer in saved["layers"]], "layers")
+        plan += zip(around, saved["layers"])
+        _require(_kind(around[-1]), saved["kind"], "kind of simulation")
     for layer, saved in plan:
         _require(_name(layer), saved["class"], "layer")
     for layer, saved in [*plan, (env, state["buffers"])]:
@@ -138,34 +140,26 @@ def _assign(layer: Any, name: str, value: Any) -> None:
         vars(layer)[name] = copy.deepcopy(value)
 
 
-def _layers(env: gym.Env) -> list[gym.Env]:
-    """The wrappers from the outside in, then the environment itself."""
-    layers = [env]
-    while isinstance(layers[-1], gym.Wrapper):
-        layers.append(layers[-1].env)
-    return layers
-
-
 # --- one environment --------------------------------------------------------------------------------------------
 
 
 def _save_env(env: gym.Env) -> dict[str, Any]:
-    *around, base = _layers(env)
-    layers = [_attributes(layer, _wrapper_state(layer)) for layer in around]
+    *around, base = layers(env)
+    kept = [_attributes(layer, _wrapper_state(layer)) for layer in around]
     kind = _kind(base)
     saved: dict[str, Any] = {"kind": kind, "np_random": None}
     if kind == "own":
-        layers.append(_attributes(base, ()))
+        kept.append(_attributes(base, ()))
         saved["simulation"] = copy.deepcopy(_call(base, 0))
     elif kind == "plain":
-        layers.append(_attributes(base, _ENVS[type(base)]))
+        kept.append(_attributes(base, _ENVS[type(base)]))
     else:
-        layers.append(_attributes(base, _MUJOCO))
+        kept.append(_attributes(base, _MUJOCO))
         # All of MjData: tasks read derived quantities, such as the place of a body, before the next step renews them.
         saved["simulation"] = pickle.dumps(base.data)  # type: ignore[attr-defined]
     if base._np_random is not None:
         saved["np_random"] = copy.deepcopy((base._np_random.bit_generator.state, base._np_random_seed))
-    return saved | {"layers": layers}
+    return saved | {"layers": kept}
 
 
 def _wrapper_state(layer: gym.Env) -> tuple[str, ...] | None:
@@ -249,7 +243,7 @@ def whereabouts(env: VecEnv) -> list[tuple[Any, ...]]:
 
 
 def _whereabouts(env: gym.Env) -> tuple[Any, ...]:
-    *around, base = _layers(env)
+    *around, base = layers(env)
     known: list[Any] = [layer._elapsed_steps for layer in around if isinstance(layer, wrappers.TimeLimit)]
     if type(base) in _ENVS:
         known.append(np.array(base.state).tobytes())  # type: ignore[attr-defined]
@@ -319,7 +313,7 @@ def accepts_seed(env: gym.Env) -> bool:
 
     :param env: an environment; it is not reset
     """
-    for layer in _layers(env):
+    for layer in layers(env):
         parameters = inspect.signature(layer.reset).parameters
         named = "seed" in parameters
         if not named and not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):

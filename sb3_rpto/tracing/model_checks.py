@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -13,7 +12,7 @@ from scipy.signal import savgol_filter
 
 from sb3_rpto.effects import Declared
 from sb3_rpto.effects.actuation import FILTERS
-from sb3_rpto.effects.names import hinges, object_names
+from sb3_rpto.effects.names import hinges, near, object_names
 from sb3_rpto.tracing.checks import WINDOW, Finding, smoothed_velocity
 from sb3_rpto.tracing.columns import columns_of, joint_of
 from sb3_rpto.tracing.measurements import Measurements
@@ -84,11 +83,7 @@ def check_names(model: mujoco.MjModel, data: Measurements) -> None:
         names, known = (list(dict.fromkeys(map(joint_of, columns))) for columns in (theirs, ours))
         for name in names:
             if name not in known:
-                near = difflib.get_close_matches(name, known, n=2, cutoff=0.5)
-                hint = (
-                    f"did you mean {' or '.join(map(repr, near))}?" if near else f"it has {', '.join(known) or 'none'}"
-                )
-                raise ValueError(f"column '{prefix}.{name}': the model has no {what} {name!r}; {hint}")
+                raise ValueError(f"column '{prefix}.{name}': the model has no {what} {name!r}; {near(name, known)}")
         for name in known:
             expected, found = ([c for c in columns if joint_of(c) == name] for columns in (ours, theirs))
             if not found:

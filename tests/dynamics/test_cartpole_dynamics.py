@@ -310,13 +310,13 @@ def test_constants_are_read_through_wrappers():
 @pytest.mark.parametrize(
     ("kwargs", "match"),
     [
-        ({"declared": ["pole_lenght"]}, "did you mean pole_length"),
+        ({"declared": ["pole_lenght"]}, "did you mean 'pole_length'"),
         ({"declared": ["theta_threshold"]}, "unknown constant 'theta_threshold'"),
         ({"declared": ["dt"]}, "unknown constant 'dt'"),
         ({"declared": []}, "one or more"),
         ({"declared": "gravity"}, "list"),
         ({"declared": ["gravity", "gravity"]}, "different"),
-        ({"constants": {"gravty": 9.0}}, "did you mean gravity"),
+        ({"constants": {"gravty": 9.0}}, "did you mean 'gravity'"),
         ({"constants": {"gravity": -9.0}}, "gravity"),
         ({"bounds": {"gravity": (1.0, 20.0)}}, "not declared"),
         ({"bounds": {"pole_length": (1.5, 2.0)}}, "around its nominal"),

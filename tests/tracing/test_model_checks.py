@@ -224,7 +224,7 @@ def test_names_that_the_model_has_not():
 
     check({"qpos.elbow": "qpos.elbo", "qvel.elbow": "qvel.elbo"}, r"no joint 'elbo'; did you mean 'elbow'")
     check({"ctrl.first": "ctrl.fist"}, r"no actuator 'fist'; did you mean 'first'")
-    check({"ctrl.first": "ctrl.zz"}, r"no actuator 'zz'; it has first, second")
+    check({"ctrl.first": "ctrl.zz"}, r"no actuator 'zz'; known: first, second")
     check({"qpos.elbow": "", "qvel.elbow": ""}, r"joint 'elbow' has no column 'qpos.elbow'; record it")
     check({"ctrl.first": ""}, r"actuator 'first' has no column 'ctrl.first'; record the command")
 
