@@ -17,7 +17,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_rpto.algorithms import arguments, checkpoint, warm
+from sb3_rpto.algorithms import arguments, checkpoint, dynamics_arguments, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.closing import LoopCloser, trace_log
 from sb3_rpto.algorithms.looping import Looping
@@ -225,10 +225,10 @@ class TransferAlgorithm(Looping):
                     self.dynamics_backend, self.env, self.dynamics_kwargs, self.declared
                 )
                 traces_log = self.measured is not None
-                arguments.check_kinds(self.close_loop)
-                arguments.check_backend(self.dynamics_config, self.close_loop, traces_log, self._passed)
-                arguments.check_something_to_fit(self.dynamics_config, self.close_loop, traces_log)
-                arguments.check_rules(self.dynamics_kwargs, self.observation_space, self.action_space)
+                dynamics_arguments.check_kinds(self.close_loop)
+                dynamics_arguments.check_backend(self.dynamics_config, self.close_loop, traces_log, self._passed)
+                dynamics_arguments.check_something_to_fit(self.dynamics_config, self.close_loop, traces_log)
+                dynamics_arguments.check_rules(self.dynamics_kwargs, self.observation_space, self.action_space)
             self._setup_model()
             if target_env is not None:
                 self.set_target_env(target_env)
