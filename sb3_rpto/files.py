@@ -21,22 +21,12 @@ def write_atomically(path: Any, write: Callable[[Any], None], suffix: str = "zip
     if path.suffix == "":
         path = path.with_name(f"{path.name}.{suffix}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{suffix}")
-    try:
-        write(temporary)
-        _replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    _replace(path, write, suffix)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """The same of contents that are known."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_bytes(content)
-        _replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    _replace(path, lambda file: file.write_bytes(content), "part")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -44,7 +34,12 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
-def _replace(temporary: Path, path: Path) -> None:
-    with temporary.open("rb+") as file:  # else the name may outlast a crash of the machine, and the contents not
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+def _replace(path: Path, write: Callable[[Path], Any], suffix: str) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{suffix}")
+    try:
+        write(temporary)
+        with temporary.open("rb+") as file:  # else the name may outlast a crash of the machine, and the contents not
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
