@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 from scipy.stats import trim_mean
 
-N_RESAMPLES = 2000
+#: Draws of a bootstrap, and what its intervals cover.
+N_RESAMPLES, CONFIDENCE = 2000, 0.95
 #: Share of the oracle's return that counts as having arrived.
 SHARE = 0.9
 
@@ -23,52 +24,42 @@ def iqm(values: np.ndarray) -> np.ndarray:
     return trim_mean(values, 0.25, axis=-1)
 
 
-def iqm_interval(values: np.ndarray, confidence: float = 0.95, seed: int = 0) -> tuple[float, float, float]:
-    """IQM of one number per seed with its percentile bootstrap interval over seeds.
+def iqm_interval(values: np.ndarray) -> tuple[float, float, float]:
+    """IQM of one number per seed with its percentile bootstrap interval of 95 % over seeds.
 
     :param values: (n_seeds,)
-    :param confidence: coverage of the interval
-    :param seed: of the resampling
     :return: (IQM, lower, upper)
     """
-    return stratified_interval([values], confidence, seed)
+    return stratified_interval([values])
 
 
-def stratified_interval(
-    strata: Sequence[np.ndarray], confidence: float = 0.95, seed: int = 0
-) -> tuple[float, float, float]:
+def stratified_interval(strata: Sequence[np.ndarray]) -> tuple[float, float, float]:
     """IQM of all runs with its stratified percentile bootstrap interval: each stratum is resampled for itself.
 
     :param strata: one number per seed for each task and target, (n_seeds,) each
-    :param confidence: coverage of the interval
-    :param seed: of the resampling
     :return: (IQM, lower, upper)
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     strata = [np.asarray(values, dtype=float) for values in strata]
     draws = np.concatenate([rng.choice(values, size=(N_RESAMPLES, len(values))) for values in strata], axis=1)
-    return float(iqm(np.concatenate(strata))), *_percentiles(iqm(draws), confidence)
+    return float(iqm(np.concatenate(strata))), *_percentiles(iqm(draws))
 
 
-def improvement(
-    pairs: Sequence[tuple[np.ndarray, np.ndarray]], confidence: float = 0.95, seed: int = 0
-) -> tuple[float, float, float]:
+def improvement(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float, float]:
     """Probability that a run of the first method beats one of the second, with its stratified bootstrap interval.
 
     P(X > Y) + P(X = Y) / 2 over all pairs of runs on a task and target, averaged over these (Agarwal et al. 2021).
 
     :param pairs: one number per seed of each method, for each task and target
-    :param confidence: coverage of the interval
-    :param seed: of the resampling
     :return: (probability, lower, upper)
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     pairs = [(np.asarray(x, dtype=float), np.asarray(y, dtype=float)) for x, y in pairs]
     drawn = [
         _beats(rng.choice(x, size=(N_RESAMPLES, len(x))), rng.choice(y, size=(N_RESAMPLES, len(y)))) for x, y in pairs
     ]
     value = float(np.mean([_beats(x, y) for x, y in pairs]))
-    return value, *_percentiles(np.mean(drawn, axis=0), confidence)
+    return value, *_percentiles(np.mean(drawn, axis=0))
 
 
 def _beats(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -77,8 +68,8 @@ def _beats(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return ((difference > 0) + 0.5 * (difference == 0)).mean(axis=(-2, -1))
 
 
-def _percentiles(draws: np.ndarray, confidence: float) -> tuple[float, float]:
-    lower, upper = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
+def _percentiles(draws: np.ndarray) -> tuple[float, float]:
+    lower, upper = np.quantile(draws, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return float(lower), float(upper)
 
 

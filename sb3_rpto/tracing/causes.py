@@ -201,11 +201,11 @@ def _unit(model: Any, dof: int, cause: str) -> str:
     }[cause]
 
 
-def binned_medians(x: np.ndarray, y: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
+def binned_medians(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Medians of ``y`` in bins of equal width over the central 99 % of ``x``; bins with few samples are left out."""
     low, high = np.quantile(x, [0.005, 0.995])
-    edges = np.linspace(low, high + 1e-12, bins + 1)
+    edges = np.linspace(low, high + 1e-12, BINS + 1)
     number = np.digitize(x, edges) - 1
-    full = [b for b in range(bins) if (number == b).sum() >= max(5, len(x) // (20 * bins))]
+    full = [b for b in range(BINS) if (number == b).sum() >= max(5, len(x) // (20 * BINS))]
     centre = (edges[:-1] + edges[1:]) / 2
     return centre[full], np.array([np.median(y[number == b]) for b in full])
