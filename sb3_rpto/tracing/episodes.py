@@ -236,13 +236,17 @@ def _quaternions(columns: Columns) -> list[tuple[str, int]]:
     return found
 
 
-def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> None:
-    """Check and repair, in place, the channels of an episode that is not yet handed out."""
+class _Tell:
+    """Findings about one episode."""
 
-    def say(kind: str, message: str, column: str = "time") -> None:
-        findings.append(Finding(kind, f"{episode.name}, {column}", message))
+    def __init__(self, episode: Episode, findings: list[Finding]) -> None:
+        self._name, self._findings = episode.name, findings
 
-    def tell(slope: float | None, column: str) -> None:
+    def __call__(self, kind: str, message: str, column: str = "time") -> None:
+        self._findings.append(Finding(kind, f"{self._name}, {column}", message))
+
+    def slope(self, slope: float | None, column: str) -> None:
+        """Of measured velocities against the positions' change, where it is not about 1."""
         if slope is None or checks.SLOPE[0] <= slope <= checks.SLOPE[1]:
             return
         kind, cause = "velocity slope", "check units and filters"
@@ -250,47 +254,64 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
             kind, cause = "flipped velocity", "its sign is flipped"
         elif any(checks.SLOPE[0] <= slope / factor <= checks.SLOPE[1] for factor in (DEGREES, 1 / DEGREES)):
             cause = "one of the two is in degrees; give both in rad"
-        say(kind, f"slope against the position's change is {slope:.2f}, not 1: {cause}; kept as it is", column)
+        self(kind, f"slope against the position's change is {slope:.2f}, not 1: {cause}; kept as it is", column)
 
-    time = episode.time
-    spread = checks.jitter(time)
+
+def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> None:
+    """Check and repair, in place, the channels of an episode that is not yet handed out."""
+    tell = _Tell(episode, findings)
+    _look_at_samples(episode, tell)
+    _repair_orientations(episode, columns, tell)
+    _unwrap_angles(episode, columns, tell)
+    _complete_velocities(episode, columns, tell)
+
+
+def _look_at_samples(episode: Episode, tell: _Tell) -> None:
+    spread = checks.jitter(episode.time)
     if spread > checks.JITTER:
-        say(
+        tell(
             "jitter",
-            f"steps vary by {spread:.0%} around their median of {np.median(np.diff(time)):.4g} s; kept as they are: "
-            "where the logger, not the robot, was late, give the times at which the samples were taken",
+            f"steps vary by {spread:.0%} around their median of {np.median(np.diff(episode.time)):.4g} s; kept as they "
+            "are: where the logger, not the robot, was late, give the times at which the samples were taken",
         )
     rows = checks.held(episode.qpos)
     if rows is not None:
-        say(
+        tell(
             "held samples",
             f"positions are fresh in every {rows}. row alone, and repeated between: keep those rows, as held ones look "
             "like late sensors and commands",
             "qpos",
         )
+
+
+def _repair_orientations(episode: Episode, columns: Columns, tell: _Tell) -> None:
+    """Unit quaternions of one sign, and their velocities compared with how they turn."""
     for joint, first in _quaternions(columns):
         norms = np.linalg.norm(episode.qpos[:, first : first + 4], axis=1)
-        if np.nanmax(np.abs(norms - 1), initial=0.0) > UNIT:
+        off = float(np.nanmax(np.abs(norms - 1), initial=0.0))
+        if off > UNIT:
             raise ValueError(
                 f"{episode.name}: qpos.{joint} holds no unit quaternion in its last four columns (norms from "
                 f"{np.nanmin(norms):.3g} to {np.nanmax(norms):.3g}); give w, x, y, z in this order"
             )
-        off = float(np.nanmax(np.abs(norms - 1), initial=0.0))
         if off > ROUNDED:
             episode.qpos[:, first : first + 4] /= norms[:, None]
             if off > WORTH_SAYING:
-                say("quaternion norm", f"off 1 by up to {off:.2g}; divided by it", f"qpos.{joint}")
+                tell("quaternion norm", f"off 1 by up to {off:.2g}; divided by it", f"qpos.{joint}")
         flips = checks.align_quaternions(episode.qpos[:, first : first + 4])
         if flips:
-            say("quaternion sign", f"{flips} change(s) between q and -q, one orientation; aligned", f"qpos.{joint}")
+            tell("quaternion sign", f"{flips} change(s) between q and -q, one orientation; aligned", f"qpos.{joint}")
         turn = [i for i, name in enumerate(columns.qvel) if joint_of(name) == joint and name not in columns.missing]
         measured, oriented = episode.qvel[:, turn[-3:]], episode.qpos[:, first : first + 4]
-        other = checks.turning_convention(time, oriented, measured) if turn else None
+        other = checks.turning_convention(episode.time, oriented, measured) if turn else None
         if other is not None:
             message = f"the numbers fit {other}; kept as they are: give w, x, y, z, and velocities in the body's frame"
-            say("other convention", message, f"qpos.{joint}")
+            tell("other convention", message, f"qpos.{joint}")
         elif turn:
-            tell(checks.turning_slope(time, oriented, measured), f"qvel.{joint}")
+            tell.slope(checks.turning_slope(episode.time, oriented, measured), f"qvel.{joint}")
+
+
+def _unwrap_angles(episode: Episode, columns: Columns, tell: _Tell) -> None:
     for i, name in enumerate(columns.qpos):
         # A turn means nothing to the coordinates of a ball or free joint.
         if name != joint_of(name):
@@ -298,24 +319,28 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
         change = None
         if name in columns.qvel and name not in columns.missing:
             velocity = episode.qvel[:, columns.qvel.index(name)]
-            change = np.diff(time) * 0.5 * (velocity[1:] + velocity[:-1])
+            change = np.diff(episode.time) * 0.5 * (velocity[1:] + velocity[:-1])
         episode.qpos[:, i], jumps, fast = checks.unwrap(episode.qpos[:, i], change)
         if jumps:
-            say("wrapped angle", f"{jumps} jump(s) of about one turn; unwrapped", f"qpos.{name}")
+            tell("wrapped angle", f"{jumps} jump(s) of about one turn; unwrapped", f"qpos.{name}")
         if fast:
             message = "many steps are of about half a turn, so whole turns may be lost: sample faster, or give qvel"
-            say("fast angle", message, f"qpos.{name}")
+            tell("fast angle", message, f"qpos.{name}")
+
+
+def _complete_velocities(episode: Episode, columns: Columns, tell: _Tell) -> None:
+    """Estimate those that were not measured; look at the others' steps and slopes."""
     turning = {joint: episode.qpos[:, first : first + 4] for joint, first in _quaternions(columns)}
     for i, name in enumerate(columns.qvel):
         velocity = episode.qvel[:, i]
         position = episode.qpos[:, columns.qpos.index(name)] if columns.slides(name) else None
         if name in columns.missing:
             if position is not None:
-                episode.qvel[:, i] = checks.smoothed_velocity(time, position)
+                episode.qvel[:, i] = checks.smoothed_velocity(episode.time, position)
             else:
-                rates = checks.angular_velocity(time, turning[joint_of(name)])
+                rates = checks.angular_velocity(episode.time, turning[joint_of(name)])
                 episode.qvel[:, i] = rates[:, int(name[-1]) % 3]  # .0 to .2 of a ball joint, .3 to .5 of a free one
-            say(
+            tell(
                 "missing velocity",
                 "not measured; estimated from the position by a cubic Savitzky-Golay filter",
                 f"qvel.{name}",
@@ -324,10 +349,10 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
         step = checks.quantum(velocity)
         if step is not None:
             levels = len(np.unique(velocity))
-            say(
+            tell(
                 "quantised velocity",
-                f"{levels} distinct values in {len(time)} samples, smallest step {step:.4g}",
+                f"{levels} distinct values in {len(velocity)} samples, smallest step {step:.4g}",
                 f"qvel.{name}",
             )
         if position is not None:
-            tell(checks.velocity_slope(time, position, velocity), f"qvel.{name}")
+            tell.slope(checks.velocity_slope(episode.time, position, velocity), f"qvel.{name}")

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.signal import butter, filtfilt
 
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation
-from sb3_rpto.effects.simulation import Switch, collect, filter_commands, names_of, prepare, pushing, settled
+from sb3_rpto.effects.simulation import Active, Switch, collect, filter_commands, names_of, prepare, pushing, settled
 from sb3_rpto.effects.world import BatchWorld, LiveWorld
 from sb3_rpto.tracing.checks import MIN_ROWS
 from sb3_rpto.tracing.episodes import Episode
@@ -61,40 +61,78 @@ def force_residuals(simulation: Simulation, values: np.ndarray, data: Measuremen
 
 
 def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e: Episode) -> ForceResidual:
-    nominal = simulation.model
     h = float(np.median(np.diff(e.time)))
     time = np.arange(e.time[0], e.time[-1], h)
-    addresses = names_of(nominal, data.columns.qpos)
-    dof_of = straight(nominal)
-    qpos = np.tile(nominal.qpos0, (len(time), 1))
-    qvel = np.zeros((len(time), nominal.nv))
-    shown = np.zeros((len(time), nominal.nv))
     low = (lambda signal: signal) if data.whole_states else _low_pass(h, len(time))
-    for column, address in enumerate(addresses):
+    active = simulation.active(values[None])
+    qpos, qvel, shown = _motion(simulation.model, data, e, time, h, low)
+    for effect, x in reversed([pair for pair in active if pair[0].senses]):
+        _undo_sensor(effect, np.repeat(x, len(time), axis=0), time, qpos, qvel)
+    commands, enabled = _commands(simulation.model, data, e, time)
+    commands = filter_commands(active, commands[None], h)[0]
+    settings = simulation.from_settings({name: np.array([value]) for name, value in e.params.items()})
+    world = BatchWorld(simulation.model, 1, 1)
+    prepare(world, [*settings, *active])
+    needed, load, known = _forces(world, pushing(active), qpos, qvel, commands, enabled, h)
+    load, known = (np.stack([low(column) for column in forces.T], axis=1) for forces in (load, known))
+    force = needed - load - known
+    edge = 1 if data.whole_states else min(round(EDGE / (_cutoff(h) * h)), len(time) // 4)
+    arrays = (a[edge : len(time) - edge] for a in (time - time[0], shown, qvel, load, commands, force))
+    return ForceResidual(e.name, *arrays)
+
+
+def _motion(
+    model: mujoco.MjModel,
+    data: Measurements,
+    e: Episode,
+    time: np.ndarray,
+    h: float,
+    low: Callable[[np.ndarray], np.ndarray],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Filtered qpos (T, nq) and qvel (T, nv) at uniform times, ``h`` apart, and scalar joints' positions (T, nv)."""
+    dof_of = straight(model)
+    qpos = np.tile(model.qpos0, (len(time), 1))
+    qvel, shown = np.zeros((len(time), model.nv)), np.zeros((len(time), model.nv))
+    for column, address in enumerate(names_of(model, data.columns.qpos)):
         path = low(np.interp(time, e.time, e.qpos[:, column]))
         qpos[:, address] = path
         if int(address) in dof_of:
             dof = dof_of[int(address)]
             shown[:, dof] = path
             qvel[:, dof] = np.gradient(path, h)
-    for column, dof in enumerate(velocity_addresses(nominal, data)):
+    for column, dof in enumerate(velocity_addresses(model, data)):
         if data.whole_states or dof not in dof_of.values():  # quaternions are not differentiated
             qvel[:, dof] = low(np.interp(time, e.time, e.qvel[:, column]))
-    active = simulation.active(values[None])
-    for effect, x in reversed([pair for pair in active if pair[0].senses]):
-        _undo_sensor(effect, np.repeat(x, len(time), axis=0), time, qpos, qvel)
-    qacc = np.gradient(qvel, h, axis=0)
+    return qpos, qvel, shown
+
+
+def _commands(model: mujoco.MjModel, data: Measurements, e: Episode, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The commands that are held at uniform times, and which actuators are enabled; (T, nu) each."""
     row = np.clip(np.searchsorted(e.time, time + 1e-9, side="right") - 1, 0, len(e) - 1)
-    commands = np.zeros((1, len(time), nominal.nu))
+    commands = np.zeros((len(time), model.nu))
     enabled = np.ones_like(commands)
-    order = command_order(nominal, data)
-    commands[0][:, order], enabled[0][:, order] = e.ctrl[row] * e.enabled[row], e.enabled[row]
-    commands = filter_commands(active, commands, h)[0]
+    order = command_order(model, data)
+    commands[:, order], enabled[:, order] = e.ctrl[row] * e.enabled[row], e.enabled[row]
+    return commands, enabled
+
+
+def _forces(
+    world: BatchWorld,
+    acting: Active,
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+    commands: np.ndarray,
+    enabled: np.ndarray,
+    h: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Generalised forces, (T, nv) each: needed by the motion, of the actuators, and of effects and friction.
+
+    :param world: one world, its model prepared; dry friction and joint limits are taken out of it
+    :param acting: effects that push
+    """
+    qacc = np.gradient(qvel, h, axis=0)
     # The motion at a sample answers to the commands held before and after it alike.
     around = 0.5 * (commands + np.concatenate([commands[:1], commands[:-1]]))
-    world = BatchWorld(nominal, 1, 1)
-    settings = simulation.from_settings({name: np.array([value]) for name, value in e.params.items()})
-    prepare(world, [*settings, *active])
     model = world.batch.get_model(0)
     friction = model.dof_frictionloss.copy()
     # Dry friction as a constraint answers to every ripple of a differentiated position: its level is taken below.
@@ -104,11 +142,9 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     mj.act[:] = settled(model, around[:1])[0]
     # Actuators with a memory are led along the motion by the simulator's own steps.
     substeps = max(1, round(h / model.opt.timestep)) if model.na or model.nhistory else 0
-    switch = Switch(LiveWorld(model, mj), None if enabled.all() else enabled)
-    needed, load = np.zeros_like(qvel), np.zeros_like(qvel)
-    extra = np.zeros_like(qvel)
-    acting = pushing(active)
-    for t in range(len(time)):
+    switch = Switch(LiveWorld(model, mj), None if enabled.all() else enabled[None])
+    needed, load, known = (np.zeros_like(qvel) for _ in range(3))
+    for t in range(len(qvel)):
         switch(t)
         mj.qpos[:], mj.qvel[:], mj.ctrl[:] = qpos[t], qvel[t], around[t]
         if substeps:
@@ -124,15 +160,10 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
             world.qpos[:], world.qvel[:] = qpos[t], qvel[t]
             world.ctrl[:] = around[t]
             collect(world, acting)
-            extra[t] = world.force[0]
+            known[t] = world.force[0]
             level = level + world.friction[0]
-        extra[t] -= level * np.sign(qvel[t])
-    load = np.stack([low(column) for column in load.T], axis=1)
-    extra = np.stack([low(column) for column in extra.T], axis=1)
-    force = needed - load - extra
-    edge = 1 if data.whole_states else min(round(EDGE / (_cutoff(h) * h)), len(time) // 4)
-    arrays = (a[edge : len(time) - edge] for a in (time - time[0], shown, qvel, load, commands, force))
-    return ForceResidual(e.name, *arrays)
+        known[t] -= level * np.sign(qvel[t])
+    return needed, load, known
 
 
 def _undo_sensor(effect: Effect, x: np.ndarray, time: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
