@@ -146,21 +146,24 @@ def shifted(task: str, shift: str, target: int) -> list[Effect]:
     env = gym.make(made.env_id)
     model = env.unwrapped.model  # type: ignore[attr-defined]
     rng = np.random.default_rng([target, *made.env_id.encode()])
-    effects: list[Effect] = [
-        d.with_values(d.values * rng.uniform(1 - SPREAD, 1 + SPREAD, 1)) for d in declare(model, made.declared)
-    ]
+    effects: list[Effect] = moved(model, made.declared, rng)
     kind, size, places = made.lacks
     if shift == "undeclared":
         for place in places:
             effect = LIBRARY[kind](place)
             effect.bind(model)
-            value = size * _peak(model, effect) if effect.place == "joint" else size
+            value = size * peak_force(model, effect) if effect.place == "joint" else size
             effects.append(effect.with_values(np.array([value])))
     env.close()
     return effects
 
 
-def _peak(model: Any, effect: Effect) -> float:
+def moved(model: Any, declared: Sequence[str], rng: np.random.Generator) -> list[Effect]:
+    """Declared numbers, each off by a random share of at most :data:`SPREAD`."""
+    return [d.with_values(d.values * rng.uniform(1 - SPREAD, 1 + SPREAD, 1)) for d in declare(model, declared)]
+
+
+def peak_force(model: Any, effect: Effect) -> float:
     """Largest force that the motor of a joint gives, N·m or N."""
     motors = np.flatnonzero(model.actuator_trnid[:, 0] == effect.index)
     return float(np.abs(model.actuator_gear[motors[0], 0] * model.actuator_ctrlrange[motors[0]]).max())

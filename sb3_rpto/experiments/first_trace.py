@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto.algorithms.closing import FIRST, window
-from sb3_rpto.effects import Declared
+from sb3_rpto.effects import Declared, Effect
 from sb3_rpto.experiments.closed_loop import (
     SHIFTS,
     TASKS,
@@ -100,7 +101,8 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
         horizon = None if job.noise else (window(data, contact_changes(base.model, data)) - 1) * float(base.dt)
         began = time.perf_counter()
         report = trace(source, data, TASKS[job.task].declared, seed=job.seed, horizon=horizon, threads=1)
-        row = {**asdict(job), **judged(job, report), "seconds": round(time.perf_counter() - began, 1)}
+        effects = shifted(job.task, job.planted, job.target)
+        row = {**asdict(job), **judged(effects, report), "seconds": round(time.perf_counter() - began, 1)}
         write_text(path, json.dumps(row, indent=1) + "\n")
     return {**asdict(job), **json.loads(path.read_text())}
 
@@ -153,9 +155,11 @@ def noisy_log(job: Job, folder: Path) -> Measurements:
     return Measurements.from_tables(tables)
 
 
-def judged(job: Job, report: Report) -> dict[str, Any]:
-    """What a report says, beside what is true."""
-    effects = shifted(job.task, job.planted, job.target)
+def judged(effects: Sequence[Effect], report: Report) -> dict[str, Any]:
+    """What a report says, beside what is true.
+
+    :param effects: what was put into the target
+    """
     truth = {e.label: float(e.values[0]) for e in effects}
     there = {e.label for e in effects if not isinstance(e, Declared)}
     named = {traced.effect.label for traced in report.effects}
