@@ -1,10 +1,11 @@
-"""Nine robots of gymnasium, five effects and none: what do 300 transitions of random actions say?
+"""Nine robots of gymnasium, five effects, none, and gusts: what do 300 transitions of random actions say?
 
     python examples/trace_robots.py
     python examples/trace_robots.py --robots Ant-v5 Reacher-v5 --kinds nothing coulomb_friction
 
 Lengths, masses or dampings are declared and off by up to a fifth; of the effect, at a joint or actuator that is drawn,
-nobody is told. No robot has a policy: it acts at random. Finished traces are kept in --runs, the table goes to --out.
+nobody is told, and gusts on a joint are no effect of the library. No robot has a policy: it acts at random. Finished
+traces are kept in --runs, the table goes to --out.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from pathlib import Path
 import pandas as pd
 from tqdm import tqdm
 
-from sb3_rpto.experiments.robots import KINDS, NOTHING, ROBOTS, Job, run
+from sb3_rpto.experiments.robots import CAUSES, ROBOTS, Job, run
 
 
 def main() -> None:
     """Trace what has no result yet, then write the table of what was asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=list(ROBOTS))
-    parser.add_argument("--kinds", nargs="+", default=[NOTHING, *KINDS], choices=[NOTHING, *KINDS])
+    parser.add_argument("--kinds", nargs="+", default=list(CAUSES), choices=CAUSES)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--workers", type=int, default=2, help="traces side by side")
     parser.add_argument("--runs", type=Path, default=Path("runs/trace_robots"), help="where single traces are kept")

@@ -152,7 +152,7 @@ def shifted(task: str, shift: str, target: int) -> list[Effect]:
         for place in places:
             effect = LIBRARY[kind](place)
             effect.bind(model)
-            value = size * peak_force(model, effect) if effect.place == "joint" else size
+            value = size * peak_force(model, effect.index) if effect.place == "joint" else size
             effects.append(effect.with_values(np.array([value])))
     env.close()
     return effects
@@ -163,9 +163,9 @@ def moved(model: Any, declared: Sequence[str], rng: np.random.Generator) -> list
     return [d.with_values(d.values * rng.uniform(1 - SPREAD, 1 + SPREAD, 1)) for d in declare(model, declared)]
 
 
-def peak_force(model: Any, effect: Effect) -> float:
+def peak_force(model: Any, joint: int) -> float:
     """Largest force that the motor of a joint gives, N·m or N."""
-    motors = np.flatnonzero(model.actuator_trnid[:, 0] == effect.index)
+    motors = np.flatnonzero(model.actuator_trnid[:, 0] == joint)
     return float(np.abs(model.actuator_gear[motors[0], 0] * model.actuator_ctrlrange[motors[0]]).max())
 
 

@@ -66,11 +66,17 @@ class Job:
 
 
 class Gusts(gym.Wrapper):
-    """A force that changes with time alone, with a phase of its own in each episode."""
+    """A force that changes with time alone, with a phase of its own in each episode.
 
-    def __init__(self, env: gym.Env, seed: int) -> None:
+    :param env: whom it pushes
+    :param seed: of the phases
+    :param dof: which coordinate
+    :param force: its amplitude in N or N·m
+    """
+
+    def __init__(self, env: gym.Env, seed: int, dof: int = 0, force: float = FORCE) -> None:
         super().__init__(env)
-        self._rng = np.random.default_rng(seed)
+        self._rng, self._dof, self._force = np.random.default_rng(seed), dof, force
 
     def reset(self, **kwargs: Any) -> Any:
         """Begin an episode at another time of the storm."""
@@ -80,7 +86,8 @@ class Gusts(gym.Wrapper):
     def step(self, action: Any) -> Any:
         """Blow, and step."""
         robot: Any = self.unwrapped
-        robot.data.qfrc_applied[0] = FORCE * np.sin(2 * np.pi * FREQUENCY * robot.data.time + self._phase)
+        phase = 2 * np.pi * FREQUENCY * robot.data.time + self._phase
+        robot.data.qfrc_applied[self._dof] = self._force * np.sin(phase)
         return self.env.step(action)
 
 

@@ -17,7 +17,7 @@ from sb3_rpto.algorithms.closing import window
 from sb3_rpto.effects import LIBRARY, Effect
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments.closed_loop import moved, peak_force
-from sb3_rpto.experiments.first_trace import judged
+from sb3_rpto.experiments.first_trace import GUSTS, Gusts, judged
 from sb3_rpto.files import write_text
 from sb3_rpto.tracing import Measurements, trace
 from sb3_rpto.tracing.contacts import contact_changes
@@ -45,7 +45,9 @@ KINDS = {
     "command_gain": (0.2, 0.0),
     "command_delay": (0.5, 0.0),
 }
-NOTHING = "nothing"
+#: What no effect of the library is has an amplitude of such a share.
+NOTHING, PUSHED = "nothing", 0.1
+CAUSES = (NOTHING, *KINDS, GUSTS)
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Job:
     """One trace.
 
     :param robot: of :data:`ROBOTS`
-    :param kind: of :data:`KINDS`, or :data:`NOTHING`
+    :param kind: of :data:`CAUSES`
     :param seed: of the declared numbers, of where the effect sits, and of the actions
     """
 
@@ -62,25 +64,28 @@ class Job:
     seed: int = 0
 
 
-def planted(job: Job) -> list[Effect]:
-    """What distinguishes the target: the declared numbers, and an effect at a place that is drawn."""
-    env: Any = gym.make(job.robot).unwrapped
-    model, rng = env.model, np.random.default_rng([job.seed, *f"{job.robot} {job.kind}".encode()])
+def make_target(job: Job) -> tuple[gym.Env, list[Effect]]:
+    """The target, and what is in it beside gusts: the declared numbers, and an effect at a place that is drawn."""
+    env = gym.make(job.robot)
+    robot: Any = env.unwrapped
+    model, rng = robot.model, np.random.default_rng([job.seed, *f"{job.robot} {job.kind}".encode()])
     effects: list[Effect] = moved(model, ROBOTS[job.robot], rng)
-    if job.kind != NOTHING:
-        motor = int(rng.integers(model.nu))
+    motor = int(rng.integers(model.nu))
+    joint = int(model.actuator_trnid[motor, 0])
+    if job.kind in KINDS:
         size, speed = KINDS[job.kind]
         if LIBRARY[job.kind].place == "joint":
-            effect = LIBRARY[job.kind](model.joint(int(model.actuator_trnid[motor, 0])).name)
-            effect.bind(model)
-            value = size * peak_force(model, effect) / (speed**2 or 1.0)
+            effect = LIBRARY[job.kind](model.joint(joint).name)
+            value = size * peak_force(model, joint) / (speed**2 or 1.0)
         else:
             effect = LIBRARY[job.kind](model.actuator(motor).name or f"actuator{motor}")
-            effect.bind(model)
-            value = size * env.dt if job.kind == "command_delay" else 1 - size
+            value = size * robot.dt if job.kind == "command_delay" else 1 - size
+        effect.bind(model)
         effects.append(effect.with_values(np.array([value])))
-    env.close()
-    return effects
+    target: gym.Env = apply_effects(env, effects)
+    if job.kind == GUSTS:
+        target = Gusts(target, job.seed, int(model.jnt_dofadr[joint]), PUSHED * peak_force(model, joint))
+    return target, effects
 
 
 def run(job: Job, folder: Path) -> dict[str, Any]:
@@ -92,18 +97,16 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
     """
     path = folder / f"{job.robot}_{job.kind}_{job.seed}.json"
     if not path.exists():
-        effects, source = planted(job), gym.make(job.robot)
-        target = Monitor(apply_effects(gym.make(job.robot), effects))
-        sac = SAC(
-            "MlpPolicy", target, buffer_size=TRANSITIONS, learning_starts=TRANSITIONS, seed=job.seed, device="cpu"
-        )
+        (target, effects), source = make_target(job), gym.make(job.robot)
+        settings: dict[str, Any] = {"buffer_size": TRANSITIONS, "learning_starts": TRANSITIONS, "seed": job.seed}
+        sac = SAC("MlpPolicy", Monitor(target), device="cpu", **settings)
         sac.learn(TRANSITIONS)  # collects, without an update
         assert sac.replay_buffer is not None
         data, base = Measurements.from_replay(sac.replay_buffer, source), cast(Any, source.unwrapped)
         horizon = (window(data, contact_changes(base.model, data)) - 1) * float(base.dt)
         began = time.perf_counter()
         report = trace(source, data, ROBOTS[job.robot], seed=job.seed, horizon=horizon, threads=1)
-        what = "" if job.kind == NOTHING else effects[-1].label
+        what = effects[-1].label if job.kind in KINDS else ""
         row = {**asdict(job), "what": what, **judged(effects, report), "seconds": time.perf_counter() - began}
         write_text(path, json.dumps(row, indent=1) + "\n")
     found: dict[str, Any] = json.loads(path.read_text())

@@ -7,8 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_rpto.effects import Declared
-from sb3_rpto.experiments.robots import KINDS, NOTHING, ROBOTS, Job, planted, run
+from sb3_rpto.effects import Declared, Effect
+from sb3_rpto.experiments.first_trace import GUSTS
+from sb3_rpto.experiments.robots import CAUSES, KINDS, NOTHING, ROBOTS, Job, make_target, run
+
+
+def planted(job: Job) -> list[Effect]:
+    """What is in the target."""
+    return make_target(job)[1]
 
 
 def test_what_is_put_in_follows_from_the_seed_and_is_a_share_of_the_motors() -> None:
@@ -32,13 +38,29 @@ def test_sizes(kind: str, value: float) -> None:
     assert planted(Job("InvertedPendulum-v5", kind))[-1].values == pytest.approx([value])
 
 
-def test_every_robot_and_kind_can_be_made() -> None:
+def test_every_robot_and_kind_can_be_made_and_moves() -> None:
     for robot in ROBOTS:
-        for kind in KINDS:
-            *declared, effect = planted(Job(robot, kind))
+        for kind in CAUSES:
+            target, effects = make_target(Job(robot, kind))
+            declared, rest = effects[: len(effects) - (kind in KINDS)], effects[len(effects) - (kind in KINDS) :]
             assert declared
             assert all(isinstance(e, Declared) for e in declared)
-            assert effect.kind == kind
+            assert [e.kind for e in rest] == [kind] * (kind in KINDS)
+            target.reset(seed=0)
+            assert np.isfinite(target.step(target.action_space.sample())[0]).all()
+
+
+def test_gusts_push_at_a_motor_by_a_share_of_its_force() -> None:
+    target, effects = make_target(Job("InvertedPendulum-v5", GUSTS))
+    assert all(isinstance(e, Declared) for e in effects)
+    target.reset(seed=0)
+    pushes = []
+    for _ in range(60):
+        target.step(np.zeros(1, dtype=np.float32))
+        pushes.append(target.unwrapped.data.qfrc_applied.copy())  # type: ignore[attr-defined]
+    slider, hinge = np.abs(pushes).max(axis=0)
+    assert slider == pytest.approx(30.0, rel=0.01)
+    assert hinge == 0.0
 
 
 def test_what_is_put_in_is_found_and_the_trace_is_kept(tmp_path: Path) -> None:
