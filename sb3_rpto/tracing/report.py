@@ -37,7 +37,8 @@ class StandIn:
 
     :param effect: with the values that it would have
     :param units: of its parameters
-    :param others: parameters of declared numbers and other named effects that lie outside their intervals then
+    :param others: parameters of declared numbers and other named effects that lie outside their intervals then, and
+        read otherwise
     """
 
     effect: Effect

@@ -11,6 +11,7 @@ import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.units import units_at
+from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import TOLERANCE, Adequacy
 from sb3_rpto.tracing.cautions import (
     above_noise,
@@ -400,8 +401,9 @@ def _stand_ins(
         moved = {}
         for i in sorted(free):
             effect, s = simulation.effects[i], simulation.slices[i]
-            for p, value, (low, high) in zip(effect.parameters, fit.values[s], intervals[:, s].T):
-                if value < low or value > high:
+            for p, value, was, (low, high) in zip(effect.parameters, fit.values[s], final.values[s], intervals[:, s].T):
+                # Intervals of exact data are as narrow as rounding.
+                if (value < low or value > high) and wording.number(value) != wording.number(was):
                     moved[effect.label if isinstance(effect, Declared) else f"{effect.label} {p.name}"] = float(value)
         there = simulation.effects[other].with_values(fit.values[simulation.slices[other]])
         found.append(StandIn(there, units_at(there, simulation.model), moved))

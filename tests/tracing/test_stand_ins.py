@@ -3,9 +3,14 @@
 import json
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import SAC
+from stable_baselines3.common.monitor import Monitor
 
+from sb3_rpto import apply_effects
+from sb3_rpto.effects import LIBRARY, declare
 from sb3_rpto.tracing import Measurements, Report, trace
 
 MASS, DAMPING, BUOYANCY, DRAG, RATE, NOISE = 0.25, 0.3, 0.9, 0.35, 200, 1e-3
@@ -61,3 +66,25 @@ def test_what_would_do_as_well_is_given_with_its_values_and_what_goes_with_them(
     (kept,) = (e for e in stored["effects"] if e["label"] == named.label)
     assert kept["instead"][0]["others"] == other.others
     assert f"{other.effect.label} instead: " in (tmp_path / "report.html").read_text()
+
+
+def test_numbers_that_read_the_same_are_not_said_to_change() -> None:
+    """Intervals of exact data are as narrow as rounding: other values lie outside, and are the same to people."""
+    source = gym.make("InvertedPendulum-v5")
+    effects = [*declare(source.unwrapped.model, ["pole.length=0.1:2", "pole.mass=1:9"])]  # type: ignore[attr-defined]
+    true = [e.with_values(np.array([v])) for e, v in zip(effects, (0.657007148, 5.15083245))]
+    friction = LIBRARY["coulomb_friction"]("slider", level=30.0)
+    target = Monitor(apply_effects(gym.make("InvertedPendulum-v5"), [*true, friction]))
+    sac = SAC("MlpPolicy", target, buffer_size=300, learning_starts=300, seed=0, device="cpu").learn(300)
+    assert sac.replay_buffer is not None
+    data = Measurements.from_replay(sac.replay_buffer, source)
+    kinds = ["coulomb_friction", "stribeck_friction"]
+    report = trace(source, data, ["pole.length", "pole.mass"], candidates=kinds, horizon=0.12, threads=1)
+    (named,) = report.effects
+    assert named.label == "coulomb_friction(slider)"
+    assert named.alike == ["stribeck_friction(slider)"]
+    (other,) = named.stand_ins  # nothing of its own is at work
+    assert dict(zip((p.name for p in other.effect.parameters), other.effect.values))["extra"] == pytest.approx(
+        0, abs=1e-3
+    )
+    assert other.others == {}
