@@ -12,16 +12,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 
 import pandas as pd
 from tqdm import tqdm
 
+from sb3_rpto.experiments.provenance import machine, versions
 from sb3_rpto.experiments.robots import CAUSES, ROBOTS, Job, run
 
 
@@ -43,12 +42,11 @@ def main() -> None:
         rows = list(tqdm(pool.map(partial(run, folder=a.runs), jobs), total=len(jobs), desc="traces"))
     table = pd.DataFrame(rows)
     table.to_csv(a.out / "traces.csv", index=False, float_format="%.4g")
-    packages = ("sb3-rpto", "torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
     manifest = {
         "command": "python examples/trace_robots.py",
         "settings": {"robots": a.robots, "kinds": a.kinds, "seeds": a.seeds},
-        "versions": {name: version(name) for name in packages},
-        "python": platform.python_version(),
+        "versions": versions(),
+        **machine(),
     }
     (a.out / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
     shown = ["robot", "what", "verdict", "named_effects", "true_effects_off", "R_before", "R_after", "seconds"]

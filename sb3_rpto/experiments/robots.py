@@ -1,4 +1,4 @@
-"""All robots of gymnasium, acting at random: is what is put into each found, and nothing where nothing is?"""
+"""Robots of gymnasium, acting at random: is what is put into each found, and nothing where nothing is?"""
 
 from __future__ import annotations
 
