@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -133,9 +134,7 @@ class LoopCloser:
         self._traced_at = model.replay_buffer.target_added
         try:
             measured = Measurements.from_replay(model.replay_buffer, model.env, noise=noise)
-            base: Any = single_env(model.env).unwrapped
-            horizon = (window(measured, contact_changes(base.model, measured)) - 1) * float(base.dt)
-            report = self._trace(model, dynamics, measured, horizon)
+            report = self._trace(model, dynamics, measured, horizon_of(measured, single_env(model.env)))
         except ValueError as error:  # of the data: what was passed was looked at before; a run must not end by it
             self._error, self._untraced = before, True
             warnings.warn(
@@ -379,6 +378,16 @@ def _say(model: Looping, report: Report, added: list[str], data: str, before: fl
             f"dynamics='residual'{steps}{bounds}",
             stacklevel=3,
         )
+
+
+def horizon_of(measured: Measurements, env: gym.Env) -> float:
+    """Length in s of the windows of a trace of transitions.
+
+    :param measured: the transitions
+    :param env: the source
+    """
+    base: Any = env.unwrapped
+    return (window(measured, contact_changes(base.model, measured)) - 1) * float(base.dt)
 
 
 def window(measured: Measurements, contacts: float) -> int:

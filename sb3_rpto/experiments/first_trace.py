@@ -14,7 +14,7 @@ import numpy as np
 from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_rpto.algorithms.closing import FIRST, window
+from sb3_rpto.algorithms.closing import FIRST, horizon_of
 from sb3_rpto.effects import Declared, Effect
 from sb3_rpto.experiments.closed_loop import (
     SHIFTS,
@@ -29,7 +29,6 @@ from sb3_rpto.experiments.closed_loop import (
 from sb3_rpto.files import write_text
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.columns import columns_of
-from sb3_rpto.tracing.contacts import contact_changes
 
 #: A noisy log: runs, steps of the policy in each, and the longest time between two samples in s.
 RUNS, STEPS, SAMPLED = 10, 100, 0.01
@@ -104,8 +103,7 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
     if not path.exists():
         source = make_source(job.task)
         data = noisy_log(job, folder) if job.noise else first_transitions(job, folder)
-        base: Any = source.unwrapped
-        horizon = None if job.noise else (window(data, contact_changes(base.model, data)) - 1) * float(base.dt)
+        horizon = None if job.noise else horizon_of(data, source)
         began = time.perf_counter()
         report = trace(source, data, TASKS[job.task].declared, seed=job.seed, horizon=horizon, threads=1)
         effects = shifted(job.task, job.planted, job.target)

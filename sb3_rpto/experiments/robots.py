@@ -6,21 +6,20 @@ import json
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_rpto.algorithms.closing import window
+from sb3_rpto.algorithms.closing import horizon_of
 from sb3_rpto.effects import LIBRARY, Effect
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments.closed_loop import moved, peak_force
 from sb3_rpto.experiments.first_trace import GUSTS, Gusts, judged
 from sb3_rpto.files import write_text
 from sb3_rpto.tracing import Measurements, trace
-from sb3_rpto.tracing.contacts import contact_changes
 
 #: What is declared of each; all of it is off by up to a fifth.
 ROBOTS = {
@@ -102,8 +101,8 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
         sac = SAC("MlpPolicy", Monitor(target), device="cpu", **settings)
         sac.learn(TRANSITIONS)  # collects, without an update
         assert sac.replay_buffer is not None
-        data, base = Measurements.from_replay(sac.replay_buffer, source), cast(Any, source.unwrapped)
-        horizon = (window(data, contact_changes(base.model, data)) - 1) * float(base.dt)
+        data = Measurements.from_replay(sac.replay_buffer, source)
+        horizon = horizon_of(data, source)
         began = time.perf_counter()
         report = trace(source, data, ROBOTS[job.robot], seed=job.seed, horizon=horizon, threads=1)
         what = effects[-1].label if job.kind in KINDS else ""
