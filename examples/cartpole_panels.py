@@ -13,10 +13,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 
 import gymnasium as gym
@@ -27,8 +25,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from tqdm import tqdm
 
 import sb3_rpto  # noqa: F401  (registers the environment)
+from sb3_rpto.experiments.provenance import machine, versions
 from sb3_rpto.experiments.report import iqm_interval, summarise
 from sb3_rpto.experiments.run import evaluate, transfer
+from sb3_rpto.files import write_json
 
 SAC_SETTINGS = {"policy_kwargs": {"net_arch": [64, 64]}, "learning_rate": 1e-3, "gamma": 0.98, "tau": 0.01}
 SHIFTS = {"length 3 m": {"pole_length": 3.0}, "gravity 80 m/s2": {"gravity": 80.0}, "force 1 N": {"force_scale": 1.0}}
@@ -219,10 +219,10 @@ def main() -> None:
         "budget": budget,
         "sac": SAC_SETTINGS,
         "shifts": shifts,
-        "versions": {name: version(name) for name in ("sb3-rpto", "torch", "stable-baselines3", "gymnasium", "numpy")},
-        "python": platform.python_version(),
+        "versions": versions(),
+        **machine(),
     }
-    (out / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
+    write_json(out / "manifest.json", manifest)
     print(table.to_string(index=False))
     print(f"figure and tables: {out}")
 

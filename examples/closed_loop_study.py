@@ -13,12 +13,9 @@ Tables, figure and manifest go to examples/results/closed_loop.
 from __future__ import annotations
 
 import argparse
-import json
-import platform
 import shlex
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from importlib.metadata import version
 from pathlib import Path
 
 import pandas as pd
@@ -26,6 +23,8 @@ from tqdm import tqdm
 
 from sb3_rpto.experiments import closed_loop as study
 from sb3_rpto.experiments.plots import learning_curves
+from sb3_rpto.experiments.provenance import machine, versions
+from sb3_rpto.files import write_json
 
 PLACE = ["task", "shift", "target", "method"]
 
@@ -79,7 +78,6 @@ def main() -> None:
         tables["oracles"] = pd.DataFrame(best)
     for name, table in tables.items():
         table.round(4).to_csv(out / f"{name}.csv", index=False)
-    packages = ("sb3-rpto", "torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
     manifest = {
         "command": " ".join(["python examples/closed_loop_study.py", *map(shlex.quote, sys.argv[1:])]),
         "episodes": episodes,
@@ -88,10 +86,10 @@ def main() -> None:
         "oracle steps": study.ORACLE_STEPS,
         "seeds run": {" ".join(map(str, p)): sorted(set(map(int, r["seed"]))) for p, r in rows.groupby(PLACE)},
         "targets": study.fingerprint(),
-        "versions": {name: version(name) for name in packages},
-        "python": platform.python_version(),
+        "versions": versions(),
+        **machine(),
     }
-    (out / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
+    write_json(out / "manifest.json", manifest)
     draw(tables["summary"], oracles, out / "returns.png")
     print(tables["summary"].to_string(index=False))
     print(f"tables: {out}")

@@ -10,11 +10,8 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
-import platform
 import time
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 
 import matplotlib
@@ -22,6 +19,7 @@ import numpy as np
 
 from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.machines import MACHINES, Machine, find_measured
+from sb3_rpto.files import write_json
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.evaluate import MOST, HorizonError, horizon_errors, predictions
 from sb3_rpto.tracing.windows import cut
@@ -166,13 +164,13 @@ def main() -> None:
         manifest = {
             "command": f"python examples/real_machines.py --only {name} --seed {arguments.seed}",
             "commit": provenance.commit(),
-            "versions": {p: version(p) for p in ("sb3-rpto", "mujoco", "numpy", "scipy")},
-            "python": platform.python_version(),
+            "versions": provenance.versions(),
+            **provenance.machine(),
             "licence": MACHINES[name](folder).licence,
             "source": MACHINES[name](folder).source,
             **found,
         }
-        (RESULTS / f"{name}.json").write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+        write_json(RESULTS / f"{name}.json", manifest)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ traces are kept in --runs, the table goes to --out.
 from __future__ import annotations
 
 import argparse
-import json
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from itertools import product
@@ -22,6 +21,7 @@ from tqdm import tqdm
 
 from sb3_rpto.experiments.provenance import machine, versions
 from sb3_rpto.experiments.robots import CAUSES, ROBOTS, Job, run
+from sb3_rpto.files import write_json
 
 
 def main() -> None:
@@ -48,7 +48,7 @@ def main() -> None:
         "versions": versions(),
         **machine(),
     }
-    (a.out / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
+    write_json(a.out / "manifest.json", manifest)
     shown = ["robot", "what", "verdict", "named_effects", "true_effects_off", "R_before", "R_after", "seconds"]
     print(table[shown].to_string(index=False))
 

@@ -14,11 +14,8 @@ to --out.
 from __future__ import annotations
 
 import argparse
-import json
-import platform
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 
@@ -27,6 +24,8 @@ from tqdm import tqdm
 
 from sb3_rpto.experiments import closed_loop as study
 from sb3_rpto.experiments.first_trace import CAUSES, Job, run
+from sb3_rpto.experiments.provenance import machine, versions
+from sb3_rpto.files import write_json
 
 
 def main() -> None:
@@ -55,7 +54,6 @@ def main() -> None:
         rows = list(tqdm(pool.map(partial(run, folder=a.runs), jobs), total=len(jobs), desc="traces"))
     table = pd.DataFrame(rows).sort_values(["task", "sensors", "shift", "target"])
     table.to_csv(a.out / "traces.csv", index=False, float_format="%.4g")
-    packages = ("sb3-rpto", "torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
     manifest = {
         "command": "python examples/trace_targets.py",
         "settings": {
@@ -65,10 +63,10 @@ def main() -> None:
             "noise": a.noise,
             "sensors": a.sensors,
         },
-        "versions": {name: version(name) for name in packages},
-        "python": platform.python_version(),
+        "versions": versions(),
+        **machine(),
     }
-    (a.out / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
+    write_json(a.out / "manifest.json", manifest)
     print(table.drop(columns=["seed", "declared_worst"]).to_string(index=False))
 
 

@@ -1,10 +1,13 @@
 """Files are written whole or not at all."""
 
+import json
+from enum import Enum
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from sb3_rpto.files import write_atomically, write_text
+from sb3_rpto.files import write_atomically, write_json, write_text
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -25,3 +28,34 @@ def test_a_writer_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path
     with pytest.raises(KeyboardInterrupt):
         write_atomically(tmp_path / "model", fails)
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("model.zip", "old")]
+
+
+def test_json_is_strict_whatever_a_result_holds(tmp_path: Path) -> None:
+    class Colour(Enum):
+        RED = "red"
+
+    given = {
+        "a": np.float32(0.5),
+        1: (np.nan, float("inf")),
+        "f": len,
+        "class": Path,
+        "path": Path("a/b"),
+        "array": np.array([[1.0, np.inf]]),
+        "enum": Colour.RED,
+        "none": None,
+    }
+    write_json(tmp_path / "result.json", given)
+
+    def never(constant: str) -> None:
+        pytest.fail(f"{constant} is not JSON")
+
+    assert json.loads((tmp_path / "result.json").read_text(), parse_constant=never) == {
+        "a": 0.5,
+        "1": [None, None],
+        "f": "builtins.len",
+        "class": f"{Path.__module__}.Path",
+        "path": "a/b",
+        "array": [[1.0, None]],
+        "enum": "red",
+        "none": None,
+    }

@@ -17,7 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.experiments.run import LearningCurve, MakeEnv
-from sb3_rpto.files import write_text
+from sb3_rpto.files import plain, write_json
 
 #: In a checkpoint: the class of its model, and the rows until then.
 CURVE = "curve.json"
@@ -56,14 +56,14 @@ class RunFolder:
         :param config: all that decides the outcome, as JSON has it
         :raises ValueError: when the folder holds a run of another configuration
         """
-        run, asked = cls(path), json.loads(json.dumps(config))
+        run, asked = cls(path), plain(config)
         path.mkdir(parents=True, exist_ok=True)
         file = path / "config.json"
         if not run.result.exists() and run.newest_checkpoint() is None:
             for kept in () if file.exists() else (run.model, run.replay_buffer):
                 if kept.exists():
                     raise ValueError(f"--out {path} holds a {kept.name} that no run of ours wrote; give another folder")
-            run._write_json(file, asked)
+            write_json(file, asked)
             return run
         begun = json.loads(file.read_text(encoding="utf-8"))
         names = {*begun, *asked}
@@ -83,7 +83,7 @@ class RunFolder:
         """
         config = json.loads((self.path / "config.json").read_text(encoding="utf-8"))
         versions = {package: version(package) for package in PACKAGES}
-        self._write_json(self.result, {"config": config, "versions": versions, "rows": rows})
+        write_json(self.result, {"config": config, "versions": versions, "rows": rows})
         shutil.rmtree(self.path / "checkpoints", ignore_errors=True)
 
     def save_checkpoint(self, steps: int, write: Callable[[Path], None]) -> None:
@@ -106,10 +106,6 @@ class RunFolder:
         """The folder of the last whole checkpoint."""
         found = sorted(path for path in (self.path / "checkpoints").glob("[0-9]*"))
         return found[-1] if found else None
-
-    @staticmethod
-    def _write_json(path: Path, content: Any) -> None:
-        write_text(path, json.dumps(content, indent=1))
 
 
 def beside(folder: Path, file: str | None) -> str | None:

@@ -26,7 +26,7 @@ from sb3_rpto.experiments.provenance import commit
 from sb3_rpto.experiments.randomised import randomised_agent
 from sb3_rpto.experiments.report import enough, iqm_interval, steps_to
 from sb3_rpto.experiments.run import transfer
-from sb3_rpto.files import write_text
+from sb3_rpto.files import write_json
 
 SHIFTS = ("declared", "undeclared", "none")
 #: Two fixed targets for each task and shift.
@@ -248,7 +248,7 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
         **kwargs,
     )
     rows = [{**row, **{name: row[name] + spent for name, spent in before.items()}} for row in rows]
-    write_text(path, json.dumps([{**row, **asdict(job), "commit": made_by} for row in rows], indent=1) + "\n")
+    write_json(path, [{**row, **asdict(job), "commit": made_by} for row in rows])
     return path
 
 
@@ -307,7 +307,7 @@ def oracle(task: str, shift: str, target: int, folder: Path, steps: int = ORACLE
             every=max(1, steps // 10),
             n_episodes=EPISODES,
         )
-        write_text(path, json.dumps({"return": max(row["return"] for row in rows), "steps": steps}) + "\n")
+        write_json(path, {"return": max(row["return"] for row in rows), "steps": steps})
     return float(json.loads(path.read_text())["return"])
 
 

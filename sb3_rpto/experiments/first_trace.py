@@ -26,7 +26,7 @@ from sb3_rpto.experiments.closed_loop import (
     shifted,
     source_agent,
 )
-from sb3_rpto.files import write_text
+from sb3_rpto.files import write_json
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.columns import columns_of
 
@@ -108,7 +108,7 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
         report = trace(source, data, TASKS[job.task].declared, seed=job.seed, horizon=horizon, threads=1)
         effects = shifted(job.task, job.planted, job.target)
         row = {**asdict(job), **judged(effects, report), "seconds": round(time.perf_counter() - began, 1)}
-        write_text(path, json.dumps(row, indent=1) + "\n")
+        write_json(path, row)
     return {**asdict(job), **json.loads(path.read_text())}
 
 

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import importlib.metadata
 import inspect
-import math
 import os
 import platform
 import subprocess
-from collections.abc import Mapping
-from enum import Enum
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
+
+from sb3_rpto.files import plain
 
 PACKAGES = ("sb3-rpto", "torch", "stable-baselines3", "sb3-contrib", "gymnasium", "mujoco", "numpy", "scipy")
 #: What a constructor takes that says nothing of the method, and attributes that are not called as the argument is.
@@ -69,25 +67,5 @@ def constructor_arguments(model: Any) -> dict[str, Any]:
             attributes = (_ATTRIBUTES.get(name, name), name, f"_{name}")
             found = [getattr(model, attribute) for attribute in attributes if hasattr(model, attribute)]
             if found:
-                values.setdefault(name, plain(found[0]))
+                values.setdefault(name, str(found[0]) if isinstance(found[0], th.device) else plain(found[0]))
     return values
-
-
-def plain(value: Any) -> Any:
-    """The same in types of strict JSON: no NaN, no infinity; classes and functions by their names."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, Enum):
-        return plain(value.value)
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int):
-        return value
-    if isinstance(value, th.device):
-        return str(value)
-    named = value if hasattr(value, "__qualname__") else type(value)
-    return f"{named.__module__}.{named.__qualname__}"

@@ -21,7 +21,7 @@ from sb3_rpto.effects import declare
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.experiments.baselines import fine_tuned_sac
 from sb3_rpto.experiments.methods import MakeEnv
-from sb3_rpto.files import write_text
+from sb3_rpto.files import write_json
 
 #: What a closed loop may spend in its corrected simulator, so that the two can be compared: updates, source steps for
 #: each, and steps of the source's policy before the first.
@@ -85,7 +85,7 @@ def randomised_agent(
         model.learn(UPDATES * SOURCE_STEPS, callback=check, reset_num_timesteps=False)
         spent: dict[str, float] = {"updates": model._n_updates - before, "source_steps": model.num_timesteps}
         spent["seconds"] = round(time.perf_counter() - began, 2)
-        write_text(cost, json.dumps(spent) + "\n")
+        write_json(cost, spent)
         os.replace(Path(kept) / "best_model.zip", path)  # last: its presence says that both are there
     return spent
 

@@ -18,7 +18,7 @@ from sb3_rpto.effects import LIBRARY, Effect
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments.closed_loop import moved, peak_force
 from sb3_rpto.experiments.first_trace import GUSTS, Gusts, judged
-from sb3_rpto.files import write_text
+from sb3_rpto.files import write_json
 from sb3_rpto.tracing import Measurements, trace
 
 #: What is declared of each; all of it is off by up to a fifth.
@@ -107,6 +107,6 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
         report = trace(source, data, ROBOTS[job.robot], seed=job.seed, horizon=horizon, threads=1)
         what = effects[-1].label if job.kind in KINDS else ""
         row = {**asdict(job), "what": what, **judged(effects, report), "seconds": time.perf_counter() - began}
-        write_text(path, json.dumps(row, indent=1) + "\n")
+        write_json(path, row)
     found: dict[str, Any] = json.loads(path.read_text())
     return found

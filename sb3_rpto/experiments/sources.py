@@ -18,7 +18,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_rpto.buffers import chronological, load_transitions
 from sb3_rpto.experiments.methods import MakeEnv
 from sb3_rpto.experiments.run import transfer
-from sb3_rpto.files import write_text
+from sb3_rpto.files import write_json
 
 #: Folder in which agents, transitions and oracles are looked for before they are made.
 FOLDER_VARIABLE = "RPTO_SOURCES"
@@ -116,7 +116,7 @@ def reference(name: str, agent: str, make_source: MakeEnv, make_target: MakeEnv,
     returns = [float(row["return"]) for row in rows]
     made = Reference(zero_shot=returns[0], oracle=max(returns), steps=steps, agent=digest(agent))
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / file, json.dumps(made, indent=1) + "\n")
+    write_json(folder / file, made)
     return made
 
 

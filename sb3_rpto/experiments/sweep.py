@@ -28,7 +28,7 @@ from sb3_rpto.experiments.provenance import commit, constructor_arguments, machi
 from sb3_rpto.experiments.run import LearningCurve
 from sb3_rpto.experiments.sources import Reference, digest, reference, source_agent
 from sb3_rpto.experiments.suites import SUITES
-from sb3_rpto.files import write_text
+from sb3_rpto.files import write_json
 
 NAME = "sb3-rpto benchmark transfer"
 BACKENDS = ("joblib", "ray")
@@ -134,7 +134,7 @@ def run(
         measured = _prepared("oracle", side_by_side(measure, targets), len(targets))
         references = known.get("references", {}) | measured
         manifest = {**_about(suite, seeds), "references": references, "versions": versions(), "commit": commit()}
-        write_text(folder / "manifest.json", json.dumps({**manifest, **machine()}, indent=1) + "\n")
+        write_json(folder / "manifest.json", {**manifest, **machine()})
         tasks = [Task(job, *agents[job.task], str(folder / "runs")) for job in listed]
         pending = [task for task in tasks if stored(task) is None]
         say = _Progress([task.job for task in pending], workers)
@@ -309,7 +309,7 @@ def work(task: Task) -> Result:
         "rows": rows,
     }
     result = plain(result)
-    write_text(Path(task.folder) / f"{job.name}.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
+    write_json(Path(task.folder) / f"{job.name}.json", result)
     return result
 
 

@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 
 from sb3_rpto.experiments import plots
-from sb3_rpto.experiments.provenance import plain
 from sb3_rpto.experiments.report import (
     PLACE,
     SHARE,
@@ -28,7 +27,7 @@ from sb3_rpto.experiments.report import (
     overall,
     scored,
 )
-from sb3_rpto.files import write_text
+from sb3_rpto.files import write_json, write_text
 
 SHARE_WORDS = f"{100 * SHARE:.0f} %"
 NAME = "sb3-rpto benchmark report"
@@ -141,7 +140,7 @@ def write(folder: str | os.PathLike[str]) -> str:
         write_text(out / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
     counted = {"runs": _runs(study.rows), "failed": study.failed, "left_out": study.left_out, "commits": study.commits}
     everything = {"manifest": study.manifest, **counted, **{n: t.to_dict("records") for n, t in tables.items()}}
-    write_text(out / "report.json", json.dumps(plain(everything), indent=1, allow_nan=False) + "\n")
+    write_json(out / "report.json", everything)
     plots.learning_curves(lines, references, study.labels, study.ours, out / "curves.png")
     text = markdown(study, tables)
     write_text(out / "report.md", text)

@@ -14,7 +14,7 @@ import numpy as np
 
 from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.planting import SYSTEMS, generate
-from sb3_rpto.files import write_text
+from sb3_rpto.files import write_json
 from sb3_rpto.tracing.calibrate import LEVEL, strongest
 from sb3_rpto.tracing.prepare import prepare
 from sb3_rpto.tracing.screen import screen
@@ -65,7 +65,7 @@ def measure(out: str | os.PathLike[str], sets: int) -> str:
             "versions": provenance.versions(),
         }
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, json.dumps(summary | made | {"sets": rows}, indent=1) + "\n")
+        write_json(path, summary | made | {"sets": rows})
     ts = [row["t"] for row in rows[:sets]]
     above = sum(t > THRESHOLD for t in ts)
     least = np.quantile(ts, LEVEL)

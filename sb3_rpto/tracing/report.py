@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +12,7 @@ import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.carry import carried_by, save_corrected
-from sb3_rpto.files import write_text
+from sb3_rpto.files import json_text, plain, write_text
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import Adequacy
 from sb3_rpto.tracing.checks import Finding, grouped
@@ -346,8 +344,8 @@ class Report:
             "horizon": self.horizon,
             "seed": self.seed,
         }
-        plain: dict[str, Any] = _plain(found)
-        return plain
+        strict: dict[str, Any] = plain(found)
+        return strict
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write ``report.html``, ``report.json`` and the corrected model (``model.xml`` and ``effects.json``).
@@ -362,7 +360,7 @@ class Report:
 
         out = Path(folder)
         # Rendered before anything is written: what fails there leaves the folder as it was.
-        page, data = render(self), json.dumps(self.to_json(), indent=1, allow_nan=False, ensure_ascii=False)
+        page, data = render(self), json_text(self.to_json())
         try:
             save_corrected(out, self.source, self.correction)
         finally:
@@ -372,18 +370,3 @@ class Report:
                 write_text(out / "report.json", data + "\n")
                 write_text(out / "report.html", page)
         return out
-
-
-def _plain(value: Any) -> Any:
-    """The same in types of strict JSON, which knows no NaN and no infinity."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, str | int) else str(value)

@@ -25,7 +25,7 @@ from sb3_rpto.algorithms.slbo import SLBO
 from sb3_rpto.buffers import load_transitions
 from sb3_rpto.experiments import sources, sweep
 from sb3_rpto.experiments.plan import Place, Variant, jobs
-from sb3_rpto.experiments.provenance import constructor_arguments, plain
+from sb3_rpto.experiments.provenance import constructor_arguments
 from sb3_rpto.experiments.suites import SMOKE, SUITES
 
 ROOT = Path(__file__).parents[2]
@@ -193,19 +193,6 @@ def test_all_arguments_of_an_algorithm_are_read_off_it() -> None:
     assert (found["dynamics"], found["gradient_steps"], found["seed"]) == ("ensemble", 3, 4)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert {"iterations", "trpo_kwargs", "gamma"} <= set(constructor_arguments(SLBO("MlpPolicy", env())))
-
-
-def test_plain_values() -> None:
-    given = {"a": np.float32(0.5), 1: (np.nan, float("inf")), "f": len, "c": SAC, "array": np.arange(2), "none": None}
-    module = "stable_baselines3.sac.sac.SAC"
-    assert plain(given) == {
-        "a": 0.5,
-        "1": [None, None],
-        "f": "builtins.len",
-        "c": module,
-        "array": [0, 1],
-        "none": None,
-    }
 
 
 # --- source agents and oracles --------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from sb3_rpto.experiments.speed import cases
 from sb3_rpto.experiments.speed.cases import Case
 from sb3_rpto.experiments.speed.memory import MAKERS, peak_memory
 from sb3_rpto.experiments.speed.timing import flops, interleaved, products
-from sb3_rpto.files import write_text
+from sb3_rpto.files import write_json, write_text
 
 __all__ = ["add_arguments", "main", "run_benchmark"]
 
@@ -69,7 +68,7 @@ def run_benchmark(out: str, scale: str, threads: Sequence[int], device: str) -> 
 
     def keep(part: str, row: Row) -> None:
         found[part].append(row)
-        write_text(Path(out) / "speed.json", json.dumps(found, indent=1) + "\n")
+        write_json(Path(out) / "speed.json", found)
         write_text(Path(out) / "speed.md", table(found["cases"], found["growth"]))
 
     try:

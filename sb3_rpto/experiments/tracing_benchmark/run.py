@@ -23,7 +23,7 @@ from sb3_rpto.effects import Effect
 from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.tracing_benchmark.design import Case, design
 from sb3_rpto.experiments.tracing_benchmark.truth import Set, make
-from sb3_rpto.files import write_text
+from sb3_rpto.files import write_json
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors
 from sb3_rpto.tracing.identify import Problem
@@ -116,7 +116,7 @@ def work(case: Case, folder: Path, commit: str | None) -> Result:
     except Exception:
         result["error"] = traceback.format_exc(limit=-3)
         result["seconds"] = time.process_time() - start
-    write_text(folder / f"{case.id}.json", json.dumps(provenance.plain(result), indent=1, allow_nan=False) + "\n")
+    write_json(folder / f"{case.id}.json", result)
     return result
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from sb3_rpto.experiments.planting import SYSTEMS
 from sb3_rpto.experiments.tracing_benchmark.design import GROUPS, HIGH, LOW, Case, fingerprint
 from sb3_rpto.experiments.tracing_benchmark.score import APPLY, MEASURES, Result, Row, Share, score, share
 from sb3_rpto.experiments.tracing_benchmark.truth import TWINS
-from sb3_rpto.files import write_text
+from sb3_rpto.files import json_text, write_text
 
 MINUTES = 3.0
 """A set of a machine with one or two joints is to be traced within this time."""
@@ -202,7 +201,7 @@ def write(out: str | os.PathLike[str], results: Sequence[Result], cases: Sequenc
         "table.md": text,
         "summary.csv": summary_csv(rows),
         "cases.csv": cases_csv(rows),
-        "manifest.json": json.dumps(manifest(results, cases, command), indent=1) + "\n",
+        "manifest.json": json_text(manifest(results, cases, command)) + "\n",
     }
     for name, content in files.items():
         write_text(Path(out) / name, content)
