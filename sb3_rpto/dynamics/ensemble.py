@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
 from sb3_rpto.dynamics.networks import Heads, StackedNetworks
-from sb3_rpto.dynamics.products import fast_products
+from sb3_rpto.dynamics.products import fast_products, no_denormals
 
 #: a known rule of the task, in torch: (observations, actions, next_observations) -> (n,)
 TransitionFn: TypeAlias = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
@@ -209,7 +209,7 @@ class EnsembleDynamics(Dynamics):
         max_steps = self.max_steps if max_steps is None else max_steps
         if max_steps < 1:
             raise ValueError(f"max_steps must be at least 1, got {max_steps}")
-        with fast_products(self.device):
+        with fast_products(self.device), no_denormals():
             train, held = self._prepare(data, weights)
             best_nll, best_error = self._judge(held)
             mark, best_state = best_error, [p.detach().clone() for p in self.networks.parameters()]

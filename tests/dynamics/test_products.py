@@ -4,7 +4,7 @@ import pytest
 import torch as th
 
 from sb3_rpto.dynamics import products
-from sb3_rpto.dynamics.products import fast_products, pays
+from sb3_rpto.dynamics.products import fast_products, no_denormals, pays
 
 
 @pytest.fixture(autouse=True)
@@ -64,3 +64,19 @@ def test_chosen_products_are_float32():
     with fast_products():
         product = a @ b
     th.testing.assert_close(product.double(), a.double() @ b.double(), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("flushed", [False, True])
+def test_numbers_below_the_smallest_normal_one_are_zero_inside_alone(flushed):
+    if not th.set_flush_denormal(flushed):
+        pytest.skip("this processor cannot take them for 0")
+    tiny = th.full((8,), 2e-38)
+    try:
+        with no_denormals():
+            assert (0.1 * tiny).count_nonzero() == 0
+        assert (0.1 * tiny).count_nonzero() == (0 if flushed else 8)
+        with pytest.raises(KeyError), no_denormals():
+            raise KeyError
+        assert (0.1 * tiny).count_nonzero() == (0 if flushed else 8)
+    finally:
+        th.set_flush_denormal(False)
