@@ -36,6 +36,8 @@ VAGUE = 0.9
 WORSE = 0.05
 #: Most windows that steps in time are compared in.
 STEPPED = 40
+#: A delay of less than this share of the time between two samples is told: clocks and integrators have such, too.
+BRIEF = 0.05
 #: Kinds of dry friction at a joint, a level of it that makes MuJoCo's own constraint act, and iterations of the fit.
 DRY, LITTLE, SOFT_FIT = ("coulomb_friction", "stribeck_friction", "position_friction"), 1e-9, 8
 
@@ -275,6 +277,23 @@ def encoder_zeros(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Findin
             "torque; check the zeros"
         )
         found.append(Finding("encoder zero", effect.label, message))
+    return found
+
+
+def brief_delays(named: Sequence[Effect], step: float) -> list[Finding]:
+    """Delays that are small beside the time between two samples: time stamps and steps in time look like them.
+
+    :param step: time between two samples in s
+    """
+    found = []
+    for effect in named:
+        delay = effect.to_json()["values"].get("delay", np.inf)
+        if delay < BRIEF * step:
+            message = (
+                f"{1e3 * delay:.2g} ms are {delay / step:.1%} of the {1e3 * step:.3g} ms between two samples: time "
+                f"stamps that are late by as much look like this, and a simulator that steps {2e3 * delay:.2g} ms"
+            )
+            found.append(Finding("brief delay", effect.label, message))
     return found
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -13,6 +15,8 @@ from sb3_rpto.tracing.measurements import Measurements
 HALF_WIDTH, HALF_COUNT = 0.025, 4
 #: The smoothed start of a window may err by so many times its computed spread: motion is not a cubic.
 TRUST = 3.0
+#: Samples that lie so many times farther off their cubic than those around other starts: a servo answered to a step.
+JUMP = 3.0
 
 
 def half_step(model: mujoco.MjModel) -> float:
@@ -100,12 +104,32 @@ def _cubic(t: np.ndarray, values: np.ndarray, lead: float) -> tuple[np.ndarray, 
     return c[0], velocity, acceleration, np.sqrt(np.sum(inverse[:2] ** 2, axis=1)), np.array([1.0, scale])
 
 
+def looseness(data: Measurements, starts: Sequence[tuple[int, int]], sigma: np.ndarray) -> np.ndarray:
+    """By how many times more than noise leaves it the smoothed state at each of n samples may err, (n, m); at least 1.
+
+    Where contacts come and go, by as much as the samples around are off their cubic. Elsewhere only where they are much
+    farther off it than is usual: too slow a log is off it everywhere, and its starts, set free, would fit anything.
+
+    :param starts: number of the episode and index of the sample
+    """
+    off = np.array([misfit(data.episodes[number], index, sigma) for number, index in starts])
+    return off if data.touching else np.where(off > JUMP * np.median(off, axis=0), off, 1.0)
+
+
 def start_state(
-    model: mujoco.MjModel, data: Measurements, episode: Episode, index: int, sigma: np.ndarray, addresses: np.ndarray
+    model: mujoco.MjModel,
+    data: Measurements,
+    episode: Episode,
+    index: int,
+    sigma: np.ndarray,
+    addresses: np.ndarray,
+    loose: np.ndarray | float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The state of the model at a sample: qpos (nq,), qvel (nv,), qacc (nv,), spread (2 nv,).
 
     The spread is of positions as :func:`moved` moves them, then of velocities.
+
+    :param loose: see :func:`looseness`, (m,)
     """
     qpos, (qvel, qacc), spread = model.qpos0.copy(), np.zeros((2, model.nv)), np.zeros(2 * model.nv)
     if data.whole_states:
@@ -128,8 +152,7 @@ def start_state(
         return qpos, qvel, qacc, spread
     lead = half_step(model)
     position, velocity, acceleration, deviation = smoothed_state(episode, index, sigma, lead)
-    if data.touching:
-        deviation = deviation * misfit(episode, index, sigma)
+    deviation = deviation * loose
     column = {int(address): i for i, address in enumerate(addresses)}
     for adr, dof in straight(model).items():
         if adr in column:

@@ -16,6 +16,7 @@ from sb3_rpto.tracing.adequacy import TOLERANCE, Adequacy
 from sb3_rpto.tracing.cautions import (
     above_noise,
     at_bounds,
+    brief_delays,
     encoder_zeros,
     finer_steps,
     missed,
@@ -141,6 +142,7 @@ def trace(
         *at_bounds(problem, final),
         *strays(selector, final, set_up, seed),
         *encoder_zeros(simulation.model, [traced.effect for traced in kept]),
+        *brief_delays([traced.effect for traced in kept], fitted.step),
         *unstable(problem, before.values, final),
     ]
     return Report(

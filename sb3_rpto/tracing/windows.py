@@ -17,7 +17,7 @@ from sb3_rpto.effects.simulation import memory, names_of
 from sb3_rpto.tracing import checks
 from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, TRUST, half_step, start_state
+from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, TRUST, half_step, looseness, start_state
 
 #: Seconds of commands kept from before a window, for effects that delay and filter: four constants of the slowest lag.
 MEMORY = 1.0
@@ -256,10 +256,11 @@ def _build(
     block = np.zeros(count, dtype=int)
     last: tuple[int, float] = (-1, 0.0)
     least = block_length(data, horizon)
+    loose = looseness(data, [(number, begin) for number, begin, _ in starts], sigma)
     for w, (number, begin, end) in enumerate(starts):
         e = data.episodes[number]
         t0 = e.time[begin]
-        qpos[w], qvel[w], qacc[w], spread[w] = start_state(model, data, e, begin, sigma, addresses)
+        qpos[w], qvel[w], qacc[w], spread[w] = start_state(model, data, e, begin, sigma, addresses, loose[w])
         grid = t0 + h * np.arange(-before, steps)
         row = np.clip(np.searchsorted(e.time, grid + 1e-6 * h, side="right") - 1, 0, len(e) - 1)
         commands[w][:, actuators] = (

@@ -9,7 +9,7 @@ import pytest
 from sb3_rpto.effects import LIBRARY, Simulation
 from sb3_rpto.effects.forces import Spring, TorqueOffset
 from sb3_rpto.tracing import Measurements, trace
-from sb3_rpto.tracing.cautions import above_noise, encoder_zeros, finer_steps, no_nearer, own_steps
+from sb3_rpto.tracing.cautions import above_noise, brief_delays, encoder_zeros, finer_steps, no_nearer, own_steps
 from sb3_rpto.tracing.evaluate import HorizonError
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.windows import cut, discretised, noise_levels
@@ -97,6 +97,15 @@ def test_a_constant_torque_where_a_servo_holds_may_be_a_zero_of_the_recordings_o
     assert "two zeros that differ by -0.5 rad" in geared
     for other in ('<motor joint="elbow"/>', '<velocity joint="elbow" kv="3"/>'):
         assert named(other) == []
+
+
+def test_a_delay_far_shorter_than_a_sample_may_be_a_clocks() -> None:
+    late = LIBRARY["sensor_delay"]("elbow", delay=2.5e-4), LIBRARY["command_delay"]("motor", delay=8e-3)
+    (found,) = brief_delays([*late, TorqueOffset("elbow", offset=1.0)], 0.02)
+    assert found.where == "sensor_delay(elbow)"
+    assert "0.25 ms are 1.2% of the 20 ms between two samples" in found.message
+    assert found.message.endswith("and a simulator that steps 0.5 ms")
+    assert brief_delays(late, 0.002) == []
 
 
 HINGED = """<mujoco><option timestep="0.001" integrator="RK4"/><worldbody><body>

@@ -157,3 +157,28 @@ def test_a_complete_machine_with_a_ball_joint_is_complete(velocities: bool) -> N
     report = trace(BALL, data, ["weight.mass"], candidates=["payload"], horizon=0.4, threads=1)
     assert report.verdict == "complete"
     assert report.adequacy_before.ratio == pytest.approx(1.0, abs=0.06)
+
+
+SERVO = """
+<mujoco><option timestep="0.002" integrator="RK4"/><worldbody><body>
+  <joint name="elbow" axis="0 1 0" damping=".2" armature=".02"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".025" mass=".8" contype="0" conaffinity="0"/>
+  <body name="hand" pos="0 0 -.3"><geom size=".04" mass=".6" contype="0" conaffinity="0"/></body></body></worldbody>
+<actuator><position name="servo" joint="elbow" kp="50" kv="3" forcerange="-20 20"/></actuator></mujoco>
+"""
+
+
+def test_a_stiff_servo_that_steps_is_complete_from_slow_positions() -> None:
+    model, resolution = mujoco.MjModel.from_xml_string(SERVO.replace('mass=".6"', 'mass=".75"')), 2 * np.pi / 4096
+    rng, tables = np.random.default_rng(0), {}
+    for run in range(8):
+        data, rows = mujoco.MjData(model), []
+        commands = np.repeat(rng.uniform(-1, 1, 20), rng.integers(15, 40))[:400]
+        for k, command in enumerate(commands):
+            data.ctrl[0] = command
+            rows.append((0.02 * k, np.round(data.qpos[0] / resolution) * resolution, command))
+            mujoco.mj_step(model, data, 10)
+        tables[f"run{run}"] = dict(zip(("time", "qpos.elbow", "ctrl.servo"), np.array(rows).T))
+    report = trace(SERVO, Measurements.from_tables(tables), declared=["hand.mass"], threads=1)
+    assert report.verdict == "complete", str(report)
+    assert report.declared[0].effect.values[0] == pytest.approx(0.75, rel=0.01)
