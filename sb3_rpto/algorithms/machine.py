@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 import warnings
+from copy import deepcopy
 from itertools import zip_longest
 
 import gymnasium as gym
+import mujoco
+import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics, Transitions
@@ -14,7 +17,7 @@ from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.effects.model import differing, sites_act
-from sb3_rpto.envs.observations import mujoco_model, single_env
+from sb3_rpto.envs.observations import layers, mujoco_model, single_env, state_map
 from sb3_rpto.tracing.columns import columns_of
 
 #: A fitted simulator should err by less than this share of a standard one-step change. Shifted tasks end below 0.15
@@ -25,15 +28,18 @@ LARGE = 0.5
 FAR, ROUNDING, MANY, MOST = 0.1, 1e-3, 0.1, 0.5
 #: And on more transitions than these.
 FEW = 2
+#: States that observation wrappers are shown.
+DRAWN = 64
 
 
 def check_machine(source: VecEnv, target: VecEnv) -> None:
     """Refuse a MuJoCo target whose observations and steps a simulator of the source cannot account for.
 
-    Joints by name and order, and the length of a step, must agree; numbers and wrappers may differ. A target that
-    shows no MuJoCo model (hardware, other processes) passes.
+    Joints by name and order, and the length of a step, must agree; numbers and wrappers may differ, but
+    observations must hold the state as the source's do. A target that shows no MuJoCo model (hardware, other
+    processes) passes.
 
-    :raises ValueError: naming the first joint that differs, or both lengths
+    :raises ValueError: naming the first joint that differs, both lengths, or the wrapper
     """
     try:
         envs = [single_env(env) for env in (source, target)]
@@ -51,6 +57,45 @@ def check_machine(source: VecEnv, target: VecEnv) -> None:
         raise ValueError(
             f"a step of target_env takes {other:g} s, one of env {mine:g} s, which no number of the model makes up "
             "for; build both with the same frame_skip times timestep"
+        )
+    _check_observations(*envs)
+
+
+def _check_observations(source: gym.Env, target: gym.Env) -> None:
+    """Refuse observation wrappers of the target with which they no longer hold its state as the source's do.
+
+    They are shown drawn states of a copy: the target itself is not touched. Noise passes.
+    """
+    wrappers = [layer for layer in layers(target) if isinstance(layer, gym.ObservationWrapper)]
+    if not wrappers or not hasattr(target.unwrapped, "_get_obs"):
+        return
+    try:
+        recover, twin = state_map(source), deepcopy(target.unwrapped)
+    except Exception:  # what cannot be read, or copied, is judged by its errors later: :func:`doubt`
+        return
+    model, data = mujoco_model(twin), twin.data  # type: ignore[attr-defined]
+    rng = np.random.default_rng(0)
+    plain: list[np.ndarray] = []
+    seen: list[np.ndarray] = []
+    for _ in range(DRAWN):
+        data.qpos[:] = model.qpos0
+        mujoco.mj_integratePos(model, data.qpos, rng.uniform(-0.2, 0.2, model.nv), 1.0)
+        data.qvel[:] = rng.uniform(-0.5, 0.5, model.nv)
+        mujoco.mj_forward(model, data)
+        observation = twin._get_obs()  # type: ignore[attr-defined]
+        plain.append(observation)
+        for wrapper in reversed(wrappers):
+            observation = wrapper.observation(observation)
+        seen.append(observation)
+    true, read = (np.concatenate(recover(np.array(shown))[:2], axis=1) for shown in (plain, seen))
+    # Coordinates that were exchanged err by 1.4 times what they vary by; unknown ones are NaN.
+    far = np.sqrt(np.mean((read - true) ** 2, axis=0)) > np.std(true, axis=0)
+    if far.any():
+        names = [*columns_of(model).qpos, *(f"the speed of {name}" for name in columns_of(model).qvel)]
+        raise ValueError(
+            f"target_env: with {' and '.join(type(w).__name__ for w in wrappers)} its observations do not hold "
+            f"{names[int(far.argmax())]} as those of env do: phi would be fitted to wrong states; leave out what "
+            "changes units or order, wrap env alike and register a state map, or pass dynamics='ensemble'"
         )
 
 
@@ -100,7 +145,8 @@ def doubt(dynamics: Dynamics, error: float) -> None:
     if found:
         warnings.warn(
             f"after the fit {' and '.join(found)}: do the target's observations hold the model's joints in its "
-            "order and units? If so, wider bounds, further declared numbers or close_loop=True may account for it",
+            "order and units? If so, wider bounds, further declared numbers or an effect that is missing "
+            "(close_loop=True looks for it) may account for it",
             stacklevel=3,
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import mujoco
@@ -404,13 +404,16 @@ def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:
     :param names: ``<object>.<parameter>``, with shell wildcards (``*.damping``) and bounds in the parameter's SI unit
         (``arm.mass=0.2:0.9``, kg)
     :return: one :class:`Declared` for each name, in order, none twice: the last entry gives its bounds
-    :raises TypeError: one string in place of a list
+    :raises TypeError: one string in place of a list, a mapping, entries that are no strings
     :raises ValueError: unknown or ambiguous names (the near ones are said), wildcards that match nothing, malformed
         bounds, bounds below 0 of what is never negative, bounds that do not hold the nominal value, a nominal value of
         zero where only factors make sense
     """
     if isinstance(names, str):
         raise TypeError(f"declared must be a list of names, not the string {names!r}; write [{names!r}]")
+    names = [names] if isinstance(names, Mapping) else list(names)  # type: ignore[list-item]
+    if not all(isinstance(name, str) for name in names):
+        raise TypeError(f"declared must be a list of names, not {names!r}; bounds are part of one: 'arm.mass=0.2:0.9'")
     found: dict[tuple[str, int, str], Declared] = {}
     for entry in names:
         name, equals, given = entry.partition("=")

@@ -1,4 +1,4 @@
-"""Recordings that nothing explains, read in another way: commands that come late, columns exchanged, a sign."""
+"""Recordings that nothing explains, read in another way: commands that come late, columns exchanged, signs."""
 
 from __future__ import annotations
 
@@ -61,22 +61,36 @@ def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
     types = {name: int(model.jnt_type[i]) for i, name in enumerate(object_names(model, "joint"))}
     scalar = [i for i, name in enumerate(columns.qpos) if types[joint_of(name)] in SCALAR_JOINTS]
     scalar = [i for i in scalar if columns.qpos[i] not in data.unobserved]
+    motors = {i: [k for k, motor in enumerate(columns.ctrl) if _acts_at(model, motor, columns.qpos[i])] for i in scalar}
     for i, j in combinations(scalar, 2):
         one, other = columns.qpos[i], columns.qpos[j]
         if types[joint_of(one)] == types[joint_of(other)]:
             order = _exchanged(len(columns.qpos), i, j)
             speeds = _exchanged(len(columns.qvel), columns.qvel.index(one), columns.qvel.index(other))
             where, what = f"qpos.{one}, qpos.{other}", f"with the positions of {one} and {other} exchanged"
-            yield Reading("exchanged", where, what, "exchange the columns", _reordered(order, speeds), order)
+            again = _reordered(order, speeds)
+            yield Reading("exchanged", where, what, "exchange the columns", again, order)
+            if len(motors[i]) == len(motors[j]) == 1:
+                (k,), (m,) = motors[i], motors[j]
+                where += f", ctrl.{columns.ctrl[k]}, ctrl.{columns.ctrl[m]}"
+                what = f"with {one} and {other} exchanged, positions and commands"
+                both = _in_turn(again, _told(_exchanged(len(columns.ctrl), k, m)))
+                yield Reading("exchanged", where, what, "exchange the columns", both, order)
     for i, j in combinations(range(len(columns.ctrl)), 2):
         one, other = columns.ctrl[i], columns.ctrl[j]
         where, what = f"ctrl.{one}, ctrl.{other}", f"with the commands of {one} and {other} exchanged"
         again = _told(_exchanged(len(columns.ctrl), i, j))
         yield Reading("exchanged", where, what, "exchange the columns", again, positions)
     for i in scalar:
-        name = columns.qpos[i]
+        name, speed = columns.qpos[i], columns.qvel.index(columns.qpos[i])
         what, remedy = f"with the sign of {name} reversed", "let the column count as the model's axis does"
-        yield Reading("reversed", f"qpos.{name}", what, remedy, _reversed(i, columns.qvel.index(name)), positions)
+        yield Reading("reversed", f"qpos.{name}", what, remedy, _reversed(i, speed, []), positions)
+        if motors[i]:  # the machine's axis may be the other way round, for its commands as well
+            commands = [columns.ctrl[k] for k in motors[i]]
+            where = ", ".join([f"qpos.{name}", *(f"ctrl.{command}" for command in commands)])
+            what = f"with the signs of {' and '.join([name, *commands])} reversed"
+            remedy = "let these columns count as the model's axis does"
+            yield Reading("reversed", where, what, remedy, _reversed(i, speed, motors[i]), positions)
 
 
 def misread(found: Found, set_up: SetUp) -> list[Finding]:
@@ -130,11 +144,21 @@ def _told(order: Sequence[int]) -> Callable[[Episode], Episode]:
     return lambda episode: replace(episode, ctrl=episode.ctrl[:, list(order)], enabled=episode.enabled[:, list(order)])
 
 
-def _reversed(position: int, speed: int) -> Callable[[Episode], Episode]:
+def _acts_at(model: mujoco.MjModel, actuator: str, joint: str) -> bool:
+    k, j = object_names(model, "actuator").index(actuator), object_names(model, "joint").index(joint)
+    return bool(model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[k, 0] == j)
+
+
+def _in_turn(first: Callable[[Episode], Episode], then: Callable[[Episode], Episode]) -> Callable[[Episode], Episode]:
+    return lambda episode: then(first(episode))
+
+
+def _reversed(position: int, speed: int, commands: Sequence[int]) -> Callable[[Episode], Episode]:
     def again(episode: Episode) -> Episode:
-        qpos, qvel = episode.qpos.copy(), episode.qvel.copy()
+        qpos, qvel, ctrl = episode.qpos.copy(), episode.qvel.copy(), episode.ctrl.copy()
         qpos[:, position] *= -1
         qvel[:, speed] *= -1
-        return replace(episode, qpos=qpos, qvel=qvel)
+        ctrl[:, list(commands)] *= -1
+        return replace(episode, qpos=qpos, qvel=qvel, ctrl=ctrl)
 
     return again

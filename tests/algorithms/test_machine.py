@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch as th
-from gymnasium.wrappers import FlattenObservation, TimeLimit, TransformReward
+from gymnasium.wrappers import FlattenObservation, TimeLimit, TransformObservation, TransformReward
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_rpto import RPTO
@@ -75,6 +75,24 @@ def test_networks_may_learn_any_target():
 def test_other_numbers_wrappers_and_targets_without_a_model_pass():
     model(TimeLimit(FlattenObservation(shifted()), 50))
     check_machine(venv(gym.make(POLES)), venv(gym.make("Pendulum-v1")))
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [(lambda o: o[SWAPPED], "hinge2?"), (lambda o: np.r_[o[:5], np.rad2deg(o[5:8]), o[8:]], "the speed of slider")],
+    ids=["order", "units"],
+)
+def test_observations_that_a_wrapper_makes_another_states_are_refused_untouched(change, named):
+    target = gym.make(POLES)
+    before = target.unwrapped.data.qpos.copy()
+    with pytest.raises(ValueError, match=f"with TransformObservation its observations do not hold {named} as those of"):
+        model(TransformObservation(target, change, target.observation_space))
+    np.testing.assert_array_equal(target.unwrapped.data.qpos, before)
+
+
+def test_noise_of_the_target_is_no_other_state():
+    target, rng = gym.make(POLES), np.random.default_rng(0)
+    model(TransformObservation(target, lambda o: o + rng.normal(0, 0.05, o.shape), target.observation_space))
 
 
 def test_joints_in_another_order_are_doubted_once():

@@ -151,6 +151,9 @@ def test_wrong_names_are_answered(name: str, said: str) -> None:
 def test_a_string_is_no_list() -> None:
     with pytest.raises(TypeError, match=r"write \['hinge.damping'\]"):
         declare(MODEL, "hinge.damping")
+    for bounds in ({"hinge.damping": (0.1, 0.5)}, [("hinge.damping", 0.1, 0.5)]):
+        with pytest.raises(TypeError, match=r"must be a list of names.*bounds are part of one: 'arm.mass=0.2:0.9'"):
+            declare(MODEL, bounds)  # type: ignore[arg-type]
 
 
 def test_one_number_is_declared_once_by_whatever_name() -> None:

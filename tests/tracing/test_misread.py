@@ -73,9 +73,19 @@ TOLD = {"ctrl.first": "ctrl.second", "ctrl.second": "ctrl.first"}
         (1, {}, {}, [("early response", {"all episodes", "ctrl"})]),
         (0, EXCHANGED, {}, [("exchanged", {"qpos.shoulder", "qpos.elbow"})]),
         (0, TOLD, {}, [("exchanged", {"ctrl.first", "ctrl.second"})]),
+        (0, EXCHANGED | TOLD, {}, [("exchanged", {*EXCHANGED, *TOLD})]),
         (0, {}, {"qpos.elbow": -1.0}, [("reversed", {"qpos.elbow"})]),
+        (0, {}, {"qpos.elbow": -1.0, "ctrl.second": -1.0}, [("reversed", {"qpos.elbow", "ctrl.second"})]),
     ],
-    ids=["as it is", "late", "positions exchanged", "commands exchanged", "reversed"],
+    ids=[
+        "as it is",
+        "late",
+        "positions exchanged",
+        "commands exchanged",
+        "joints exchanged",
+        "reversed",
+        "axis reversed",
+    ],
 )
 def test_what_was_logged_otherwise_is_told_though_something_is_missing_too(
     late: int, names: dict[str, str], signs: dict[str, float], said: list[tuple[str, set[str]]]
@@ -87,11 +97,13 @@ def test_what_was_logged_otherwise_is_told_though_something_is_missing_too(
 def test_an_exchange_and_a_sign_are_undone_by_themselves() -> None:
     model, data = mujoco.MjModel.from_xml_string(ARM), Measurements.from_tables(recorded())
     found = list(readings(model, data))
-    assert [r.kind for r in found] == ["early response", "exchanged", "exchanged", "reversed", "reversed"]
+    assert [r.kind for r in found] == ["early response", *["exchanged"] * 3, *["reversed"] * 4]
     episode = data.episodes[0]
+    ways = []
     for reading in found[1:]:
         once, twice = reading.again(episode), reading.again(reading.again(episode))
         for name in ("qpos", "qvel", "ctrl", "enabled"):
             np.testing.assert_array_equal(getattr(twice, name), getattr(episode, name))
-        changed = [not np.array_equal(getattr(once, name), getattr(episode, name)) for name in ("qpos", "qvel", "ctrl")]
-        assert changed in ([True, True, False], [False, False, True])
+        ways.append([not np.array_equal(getattr(once, n), getattr(episode, n)) for n in ("qpos", "qvel", "ctrl")])
+    moved, told, both = [True, True, False], [False, False, True], [True, True, True]
+    assert ways == [moved, both, told, moved, both, moved, both]
