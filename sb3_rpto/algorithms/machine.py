@@ -82,7 +82,7 @@ def _check_observations(source: gym.Env, target: gym.Env) -> None:
         mujoco.mj_integratePos(model, data.qpos, rng.uniform(-0.2, 0.2, model.nv), 1.0)
         data.qvel[:] = rng.uniform(-0.5, 0.5, model.nv)
         mujoco.mj_forward(model, data)
-        observation = twin._get_obs()  # type: ignore[attr-defined]
+        observation = twin._get_obs()
         plain.append(observation)
         for wrapper in reversed(wrappers):
             observation = wrapper.observation(observation)
