@@ -39,6 +39,11 @@ class Adequacy:
         """Whether the ratio reaches down to one, within the tolerance of the noise estimate, with few stray windows."""
         return self.low <= 1 + TOLERANCE and self.chance > CHANCE
 
+    @property
+    def denied_by_strays(self) -> bool:
+        """Whether the typical error is no more than noise, and single windows alone say that something is missing."""
+        return self.low <= 1 + TOLERANCE and not self.adequate
+
     def __str__(self) -> str:
         return f"R = {self.ratio:.2f} [{self.low:.2f}, {self.high:.2f}]"
 

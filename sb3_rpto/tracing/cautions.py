@@ -13,7 +13,7 @@ from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.declared import servo_of
 from sb3_rpto.effects.units import joint_of
 from sb3_rpto.tracing import wording
-from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE
+from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE, Adequacy
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor, observed, predictions
 from sb3_rpto.tracing.identify import Problem
@@ -92,8 +92,12 @@ def above_noise(after: list[HorizonError], floor: list[HorizonError], ratio: flo
     return [Finding("few windows", "test runs", message)]
 
 
-def strays(selector: Selector, values: np.ndarray, set_up: SetUp, seed: int) -> list[Finding]:
-    """Windows that the final model misses by far, run by run: one that stalled or was touched leaves them."""
+def strays(selector: Selector, values: np.ndarray, set_up: SetUp, after: Adequacy, seed: int) -> list[Finding]:
+    """Windows that the final model misses by far, run by run: one that stalled or was touched leaves them.
+
+    :param values: of that model, (p,)
+    :param after: its adequacy
+    """
     parts = [(selector.train, set_up.fitted)] + ([(selector.select, set_up.select)] if selector.select else [])
     fits = [problem.score(values) for problem, _ in parts]
     errors = np.concatenate([fit.errors for fit in fits])
@@ -112,6 +116,8 @@ def strays(selector: Selector, values: np.ndarray, set_up: SetUp, seed: int) -> 
                 f"{stray[rows].sum()} of {rows.sum()} windows err far more than the others, most the one at "
                 f"{times[worst]:.3g} s of {runs[worst]}; fits give them little weight (robust loss)"
             )
+            if after.denied_by_strays:
+                message += "; such windows alone deny that the model accounts for the data: see what happens there"
             found.append(Finding("stray windows", where, message))
     return found
 

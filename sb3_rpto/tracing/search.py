@@ -126,7 +126,10 @@ def closely(
     :param finer: as in :func:`find`
     :param seed: of the resampling
     """
-    then = None if seen.adequate else finer(on.fine.horizon)
+    if seen.adequate:
+        return on, model, seen
+    on.say(0.0, "judging with shorter steps in time")
+    then = finer(on.fine.horizon)
     if then is None or not judged(then.fine, model, seed).ratio < (1 - FINER) * seen.ratio:
         return on, model, seen
     then.fine.threshold = then.rough.threshold = on.fine.threshold

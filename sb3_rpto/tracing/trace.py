@@ -140,7 +140,7 @@ def trace(
         *_of_the_verdict(searched, problem, final, (errors_before, errors_after, floor), seed),
         *undetermined(problem, final, intervals),
         *at_bounds(problem, final),
-        *strays(selector, final, set_up, seed),
+        *strays(selector, final, set_up, found.after, seed),
         *encoder_zeros(simulation.model, [traced.effect for traced in kept]),
         *brief_delays([traced.effect for traced in kept], fitted.step),
         *unstable(problem, before.values, final),

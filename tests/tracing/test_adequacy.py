@@ -65,6 +65,7 @@ def test_a_missing_effect_lifts_the_ratio_above_its_interval(seed: int) -> None:
     found = adequacy(p, p.score(NOTHING), seed)
     assert found.low > 1.5
     assert not found.adequate
+    assert not found.denied_by_strays
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -73,13 +74,16 @@ def test_a_misfit_of_a_few_windows_is_seen_by_their_number_alone(episodes: int, 
     p = recordings(seed, episodes)
     assert len(p.windows) == 5 * episodes
     errors = of_noise(p, seed)
-    assert adequacy(p, with_errors(p, errors), seed).adequate
+    usual = adequacy(p, with_errors(p, errors), seed)
+    assert usual.adequate
+    assert not usual.denied_by_strays
     errors[::every] *= 6.0
     found = adequacy(p, with_errors(p, errors), seed)
     assert found.low < 1.06
     assert found.strays == pytest.approx(1 / every, abs=0.02)
     assert found.chance < 0.1 * CHANCE
     assert not found.adequate
+    assert found.denied_by_strays
 
 
 def test_chance_is_the_binomials() -> None:
