@@ -23,7 +23,7 @@ def shifted(env_id, shift=None, effects=()):
     """A target with other numbers and further effects."""
     env = gym.make(env_id)
     shift = SHIFTS[env_id] if shift is None else shift
-    numbers = declare(env.unwrapped.model, shift)
+    numbers = declare(env.unwrapped.model, [*shift])
     return apply_effects(env, [n.with_values(np.array([shift[n.label]])) for n in numbers] + list(effects))
 
 

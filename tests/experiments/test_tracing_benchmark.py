@@ -243,7 +243,7 @@ def test_twins_move_alike(name):
     model = mujoco.MjModel.from_xml_string(machine.xml)
 
     def shown(effects, values, offset):
-        known = [d.with_values(np.array([values[d.label]])) for d in declare(model, values)]
+        known = [d.with_values(np.array([values[d.label]])) for d in declare(model, [*values])]
         start = q.copy()
         start[:, 0] -= offset
         moved = predict(machine.xml, [*known, *(LIBRARY[k](on, **v) for k, on, v in effects)], start, commands)
