@@ -21,7 +21,7 @@ def steps_of(data, env_id, chosen=None):
 
 def simulation(env_id, names, effects=()):
     model = gym.make(env_id).unwrapped.model
-    return Simulation(model, [*declare(model, names), *effects], nthread=1)
+    return Simulation(model, [*declare(model, [*names]), *effects], nthread=1)
 
 
 def problem(steps, names, env_id, weights=None, bounds=None):
