@@ -145,7 +145,10 @@ def _told(order: Sequence[int]) -> Callable[[Episode], Episode]:
 
 
 def _acts_at(model: mujoco.MjModel, actuator: str, joint: str) -> bool:
-    k, j = object_names(model, "actuator").index(actuator), object_names(model, "joint").index(joint)
+    actuators = object_names(model, "actuator")
+    if actuator not in actuators:  # one of several commands of an actuator
+        return False
+    k, j = actuators.index(actuator), object_names(model, "joint").index(joint)
     return bool(model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[k, 0] == j)
 
 

@@ -107,3 +107,10 @@ def test_an_exchange_and_a_sign_are_undone_by_themselves() -> None:
         ways.append([not np.array_equal(getattr(once, n), getattr(episode, n)) for n in ("qpos", "qvel", "ctrl")])
     moved, told, both = [True, True, False], [False, False, True], [True, True, True]
     assert ways == [moved, both, told, moved, both, moved, both]
+
+
+def test_one_of_several_commands_of_an_actuator_is_not_a_joints() -> None:
+    model, tables = mujoco.MjModel.from_xml_string(ARM), recorded()
+    data = misheard(tables, {"ctrl.first": "ctrl.first.0"}, {})
+    said = [reading.where for reading in readings(model, data) if reading.kind == "reversed"]
+    assert said == ["qpos.shoulder", "qpos.elbow", "qpos.elbow, ctrl.second"]
