@@ -411,11 +411,11 @@ def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:
     """
     if isinstance(names, str):
         raise TypeError(f"declared must be a list of names, not the string {names!r}; write [{names!r}]")
-    names = [names] if isinstance(names, Mapping) else list(names)  # type: ignore[list-item]
-    if not all(isinstance(name, str) for name in names):
+    entries = [*names]
+    if isinstance(names, Mapping) or not all(isinstance(entry, str) for entry in entries):
         raise TypeError(f"declared must be a list of names, not {names!r}; bounds are part of one: 'arm.mass=0.2:0.9'")
     found: dict[tuple[str, int, str], Declared] = {}
-    for entry in names:
+    for entry in entries:
         name, equals, given = entry.partition("=")
         bounds = _bounds(entry, given) if equals else None
         matches = [name]

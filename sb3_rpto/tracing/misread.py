@@ -9,9 +9,10 @@ from itertools import combinations
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.actuation import drivers
 from sb3_rpto.effects.names import SCALAR_JOINTS, object_names
 from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.columns import joint_of
+from sb3_rpto.tracing.columns import Columns, joint_of
 from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.measurements import Measurements
@@ -61,7 +62,7 @@ def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
     types = {name: int(model.jnt_type[i]) for i, name in enumerate(object_names(model, "joint"))}
     scalar = [i for i, name in enumerate(columns.qpos) if types[joint_of(name)] in SCALAR_JOINTS]
     scalar = [i for i in scalar if columns.qpos[i] not in data.unobserved]
-    motors = {i: [k for k, motor in enumerate(columns.ctrl) if _acts_at(model, motor, columns.qpos[i])] for i in scalar}
+    motors = {i: _commands_at(model, columns, columns.qpos[i]) for i in scalar}
     for i, j in combinations(scalar, 2):
         one, other = columns.qpos[i], columns.qpos[j]
         if types[joint_of(one)] == types[joint_of(other)]:
@@ -144,12 +145,11 @@ def _told(order: Sequence[int]) -> Callable[[Episode], Episode]:
     return lambda episode: replace(episode, ctrl=episode.ctrl[:, list(order)], enabled=episode.enabled[:, list(order)])
 
 
-def _acts_at(model: mujoco.MjModel, actuator: str, joint: str) -> bool:
-    actuators = object_names(model, "actuator")
-    if actuator not in actuators:  # one of several commands of an actuator
-        return False
-    k, j = actuators.index(actuator), object_names(model, "joint").index(joint)
-    return bool(model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[k, 0] == j)
+def _commands_at(model: mujoco.MjModel, columns: Columns, joint: str) -> list[int]:
+    """The columns of ``ctrl`` that drive a joint; those of an actuator that takes several are none."""
+    names, index = object_names(model, "actuator"), object_names(model, "joint").index(joint)
+    there = {names[actuator] for actuator in drivers(model, index)}
+    return [k for k, name in enumerate(columns.ctrl) if name in there]
 
 
 def _in_turn(first: Callable[[Episode], Episode], then: Callable[[Episode], Episode]) -> Callable[[Episode], Episode]:
