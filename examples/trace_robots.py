@@ -1,4 +1,4 @@
-"""Nine robots of gymnasium, five effects, none, and gusts: what do 300 transitions of random actions say?
+"""Nine robots of gymnasium, six effects, none, and gusts: what do 300 transitions of random actions say?
 
     python examples/trace_robots.py
     python examples/trace_robots.py --robots Ant-v5 Reacher-v5 --kinds nothing coulomb_friction

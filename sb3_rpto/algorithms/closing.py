@@ -22,9 +22,9 @@ from sb3_rpto.effects import Declared, from_json
 from sb3_rpto.envs.observations import single_env
 from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.tracing.adequacy import SETTLED
 from sb3_rpto.tracing.contacts import OFTEN, contact_changes
 from sb3_rpto.tracing.report import Traced
-from sb3_rpto.tracing.trace import SETTLED
 from sb3_rpto.tracing.zeros import Zeros
 
 if TYPE_CHECKING:
@@ -156,10 +156,15 @@ class LoopCloser:
         phi takes all that is found, as long as the simulator with it is stable, and where the verdict is
         ``unexplained`` errs less on the log; D_target is read anew, as the corrected environment shows it, and without
         encoder zeros that differ by run. What the uncorrected source produced is :attr:`stale` from then on.
+
+        :raises ValueError: the log cannot be traced, e.g. is too short
         """
         data = model.transitions("target")
         before = dynamics.error(data)
-        report = self._trace(model, dynamics, measured, None)
+        try:
+            report = self._trace(model, dynamics, measured, None)
+        except ValueError as error:
+            raise ValueError(f"target_data: {error}") from error
         added = self._take(model, dynamics, report, data, math.inf)
         self.zeros = report.zeros
         self.fill_target(model, dynamics, measured)

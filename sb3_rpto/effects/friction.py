@@ -35,6 +35,24 @@ class CoulombFriction(Effect):
 
 
 @register
+class SoftFriction(CoulombFriction):
+    r"""MuJoCo's ``frictionloss`` alone: :math:`-F_c\,\mathrm{sign}(\dot q)`, which gives way near rest.
+
+    It acts in the constraint that the model has (by default over ``solref`` of 0.02 s), so that a loaded joint creeps,
+    as no machine's does: a trace looks for it where the robot seems to be simulated
+    (:func:`sb3_rpto.tracing.conclude.conclude`).
+    """
+
+    kind = "soft_friction"
+    equation = "-level sign(qd), giving way over solref"
+    offered = False
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Add to frictionloss, and leave its constraint as it is."""
+        world.field("dof_frictionloss")[:, self.dof] += x[:, 0]
+
+
+@register
 class StribeckFriction(Effect):
     r"""Dry friction that is higher near rest: :math:`F_c + (F_s - F_c) e^{-(\dot q / v_s)^2}` (Stribeck 1902).
 

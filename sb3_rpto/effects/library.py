@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 
 import mujoco
 
@@ -11,8 +11,8 @@ from sb3_rpto.effects.effect import LIBRARY, Effect
 from sb3_rpto.effects.names import near, object_id
 
 
-def candidates(model: mujoco.MjModel, exclude: Iterable[str] = ()) -> list[Effect]:
-    """Every registered effect at every place of a model where it makes sense, all at their null values.
+def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Container[str] | None = None) -> list[Effect]:
+    """Registered effects at every place of a model where they make sense, all at their null values.
 
     =====================================================  ==========================================================
     place                                                  effects
@@ -35,14 +35,18 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = ()) -> list[Effec
     ``frictionloss`` coulomb_friction, ``stiffness`` spring, ``armature`` armature, ``arm.length`` link_length(arm), a
     geom's ``friction`` geom_friction, an actuator's ``gain``, ``gear`` or ``strength`` command_gain, ``option.density``
     and ``option.viscosity`` fluid. A declared mass leaves payload in: it moves the centre of mass too.
+    soft_friction is left out unless it is named: no machine has it.
 
     :param model: the compiled model
     :param exclude: names of declared parameters, as :func:`~sb3_rpto.effects.declare` takes them
+    :param kinds: of effects; None: all that are :attr:`~sb3_rpto.effects.Effect.offered`
     :raises ValueError: a name in ``exclude`` is unknown
     """
     declared = {(d.owner, d.index, d.label.rpartition(".")[2]) for d in declare(model, exclude)}
     found = []
     for kind in LIBRARY.values():
+        if not (kind.offered if kinds is None else kind.kind in kinds):
+            continue
         for on in kind.places(model):
             owner = "option" if kind.place == "world" else kind.place
             index = 0 if kind.place in ("world", "sensor") else object_id(model, owner, on)
@@ -75,7 +79,7 @@ def given(model: mujoco.MjModel, declared: Sequence[str], known: Sequence[Effect
     # Bounds are those of the last entry: what the user declared.
     names = [*(effect.label for effect in known if isinstance(effect, Declared)), *declared]
     found: list[Effect] = [*declare(model, names)]
-    everywhere, free = ({e.label for e in candidates(model, taken)} for taken in ((), names))
+    everywhere, free = ({e.label for e in candidates(model, taken, LIBRARY)} for taken in ((), names))
     for effect in [effect for effect in known if not isinstance(effect, Declared)]:
         label = effect.label
         if label not in everywhere:

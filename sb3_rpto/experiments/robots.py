@@ -39,6 +39,7 @@ TRANSITIONS = 300
 #: follows, of the command, or of a step of the environment.
 KINDS = {
     "coulomb_friction": (0.1, 0.0),
+    "soft_friction": (0.1, 0.0),
     "quadratic_drag": (0.1, 5.0),
     "torque_offset": (0.1, 0.0),
     "command_gain": (0.2, 0.0),

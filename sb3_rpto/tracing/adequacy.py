@@ -15,6 +15,8 @@ TOLERANCE = 0.06
 #: exceeds in one of a hundred. More than twice as many as that, beyond chance, are too many.
 BEYOND, RARE, CHANCE = 1.25, 0.02, 1e-3
 RESAMPLES = 400
+#: Verdicts that leave nothing to look for.
+SETTLED = ("complete", "explained")
 
 
 @dataclass(frozen=True)
@@ -92,3 +94,21 @@ def adequacy(problem: Problem, fit: Fit, seed: int) -> Adequacy:
         float(stray.mean()),
         float(binom.sf(count - 1, len(stray), RARE)),
     )
+
+
+def judge(before: Adequacy, after: Adequacy, named: bool) -> str:
+    """The verdict from adequacy before and after.
+
+    ``complete``: nothing is missing. ``explained``: what is left with the named effects is no more than noise.
+    ``partly explained``: they at least halve the excess log error (or, where the typical error is no more than noise,
+    the share of windows that are). ``unexplained``: they do not.
+    """
+    if not named:
+        return "complete" if before.adequate else "unexplained"
+    if after.adequate:
+        return "explained"
+    if before.ratio <= 1 + TOLERANCE:  # only stray windows deny that it is complete
+        halved = after.strays <= 0.5 * before.strays
+    else:
+        halved = np.log(max(after.ratio, 1.0)) <= 0.5 * np.log(before.ratio)
+    return "partly explained" if halved else "unexplained"

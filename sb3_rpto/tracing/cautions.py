@@ -154,34 +154,43 @@ def at_bounds(problem: Problem, values: np.ndarray) -> list[Finding]:
     return found
 
 
-def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> list[Finding]:
-    """Whether dry friction, named or known, would leave less as MuJoCo's own, which creeps where nothing else is said.
+def creeping(problem: Problem, values: np.ndarray, named: Sequence[int]) -> tuple[list[Effect], float]:
+    """Dry friction, named or known, and the share of the error that is left where it is as MuJoCo's own.
 
-    So does that of a robot that somebody simulates by ``frictionloss`` alone, and of no machine.
+    That creeps where nothing else is said. So does that of a robot that somebody simulates by ``frictionloss`` alone,
+    and of no machine.
 
     :param values: of the model that leaves something, (p,)
     :param named: indices of its effects that were not known
+    :return: those that may creep, at joints without friction in the model; the share is 1 where there are none
     """
-    simulation, model = problem.simulation, problem.simulation.model.__copy__()
+    simulation = problem.simulation
     there = [e for i, e in enumerate(simulation.effects) if i in named or e.known]
-    joints = [e for e in there if e.kind in DRY]
-    dofs = [d for d in (model.jnt_dofadr[e.index] for e in joints) if model.dof_frictionloss[d] == 0]
-    if not dofs:
-        return []
+    firm = [e for e in there if e.kind in DRY and simulation.model.dof_frictionloss[e.dof] == 0]
+    if not firm:
+        return [], 1.0
     places = [s for e, s in zip(simulation.effects, simulation.slices) if e in there]
     free = np.concatenate([np.arange(s.start, s.stop) for s in places])
-    model.dof_frictionloss[dofs] = LITTLE  # a joint that has some keeps its own constraint, see World.rough
+    model = simulation.model.__copy__()
+    # A joint that has some keeps its own constraint, see World.rough.
+    model.dof_frictionloss[[e.dof for e in firm]] = LITTLE
     soft = Simulation(model, [copy(e) for e in simulation.effects], simulation.nthread)
     fit = Problem(soft, problem.windows, problem.scales).fit(values, free, iterations=SOFT_FIT)
-    share = float(np.median(fit.errors) / np.median(problem.score(values).errors))
+    return firm, float(np.median(fit.errors) / np.median(problem.score(values).errors))
+
+
+def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> list[Finding]:
+    """Whether dry friction that gives way at rest would leave less, see :func:`creeping`."""
+    firm, share = creeping(problem, values, named)
     if share > 1 - WORSE:
         return []
     message = (
-        f"dry friction that gives way over {1e3 * model.dof_solref[dofs[0], 0]:g} ms, as MuJoCo's does by default, "
-        f'leaves {share:.0%} of the error. Is this robot simulated? Set solreffriction="0.001 1" there, and '
-        'solimpfriction="0.99 0.99", as that of machines holds; or give the model such friction and declare it'
+        f"dry friction that gives way over {1e3 * problem.simulation.model.dof_solref[firm[0].dof, 0]:g} ms, as "
+        f"MuJoCo's does by default, leaves {share:.0%} of the error. Is this robot simulated? Set "
+        'solreffriction="0.001 1" there, and solimpfriction="0.99 0.99", as that of machines holds; or name '
+        "soft_friction among the candidates, or among the known effects"
     )
-    return [Finding("soft friction", ", ".join(e.label for e in joints), message)]
+    return [Finding("soft friction", ", ".join(e.label for e in firm), message)]
 
 
 def own_steps(

@@ -50,6 +50,8 @@ class Measurements:
     :param unobserved: names of ``columns.qpos`` that were not measured: not to be compared with a prediction
     :param exact: whether the samples come from a simulator: no measurement noise, exact velocities
     :param simulated: whether the model's own steps in time are to meet them, noise apart
+    :param idle: whether nothing was commanded before a run began, as after the reset of an environment; else its first
+        command is taken to have held
     :param touching: whether contacts come and go in these measured data
     :param noise: of positions and velocities, where it is known; None: it is estimated from the positions, and exact
         samples have none
@@ -61,6 +63,7 @@ class Measurements:
     unobserved: tuple[str, ...] = ()
     exact: bool = False
     simulated: bool = False
+    idle: bool = False
     touching: bool = False
     noise: Noise | None = None
 

@@ -27,6 +27,10 @@ CLEARLY, SOMEWHAT = 0.5, 0.8
 #: They may be exact where their noise is less than this share of what exact ones count as noisy by.
 NOISELESS = 0.03
 
+#: Nothing was commanded before the runs where their first steps err by less than this share of what they do with their
+#: own commands, if those come at once.
+IDLE = 0.75
+
 Origin: TypeAlias = Literal["machine", "simulated", "exact"]
 
 
@@ -38,6 +42,37 @@ def may_be_exact(data: Measurements) -> bool:
     """
     step = data.step
     return not (data.whole_states or data.columns.missing or data.unobserved) and bool(step >= SLOW)
+
+
+def idle(simulation: Simulation, data: Measurements, sigma: np.ndarray) -> bool:
+    """Whether runs of a simulator seem to begin without a command: their first steps go rather as with none.
+
+    So they do where a queue of commands is empty at a reset. Where nothing is late, what was before does not matter.
+
+    :param simulation: of the model
+    :param data: to fit to
+    :param sigma: noise of each position column, (m,)
+    """
+    beginnings = [e.part_of(slice(0, 3), False) for e in data.episodes if not e.after_gap and len(e) > 2]
+    if not beginnings or not simulation.model.nu:
+        return False
+    try:
+        windows = cut(simulation.model, replace(data, episodes=beginnings), sigma, 2 * data.step, len(beginnings))
+    except ValueError:  # none of their states is known
+        return False
+    steps = windows.at[:, 0].astype(int)
+    rows, moved = np.arange(len(windows)), windows.measured[:, 0] - windows.qpos[:, windows.columns]
+    values = np.tile(simulation.null, (len(windows), 1))
+
+    def error(share: float) -> float:
+        commands = windows.drive.commands.copy()
+        commands[:, windows.drive.before :] *= share
+        drive = windows.drive._replace(commands=commands)
+        qpos, _ = simulation.rollout(values, windows.qpos, windows.qvel, drive)
+        missed = qpos[rows, steps][:, windows.columns] - windows.measured[:, 0]
+        return float(np.median(np.abs(missed / np.maximum(moved.std(axis=0), windows.sigma)).sum(axis=1)))
+
+    return error(0.0) < IDLE * error(1.0)
 
 
 def origin(

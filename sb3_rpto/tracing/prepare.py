@@ -22,7 +22,7 @@ from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.contacts import OFTEN, contact_changes
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.model_checks import check_against, soft_friction, soft_ties
-from sb3_rpto.tracing.origin import origin
+from sb3_rpto.tracing.origin import idle, origin
 from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.search import Selectors
 from sb3_rpto.tracing.select import Selector
@@ -181,11 +181,15 @@ def prepare(
         if isinstance(one, Declared) and one.number in settings:
             column = f"param.{settings[one.number]}"
             raise ValueError(f"declared {one.label!r} is the column {column!r} of the data, too; leave one of them out")
-    effects = [*there, *_candidates(nominal, there, kinds)]
+    effects = [*there, *_candidates(nominal, there, kinds, data.exact)]
     for effect in effects:
         if not type(effect).__module__.startswith("sb3_rpto."):
             try_out(nominal, effect)
     fine = Simulation(nominal, effects, threads)
+    if (data.exact or data.simulated) and idle(fine, fitted, sigma):
+        train, select, test, fitted = (replace(d, idle=True) for d in (train, select, test, fitted))
+        message = "the first steps go as without a command: what is late has none to act on then"
+        findings.append(Finding("idle start", "fitted runs", message))
     scales = typical(fine, force_residuals(fine, fine.null, fitted)).scales(effects)
     rough = Simulation(discretised(compiled, fitted, fine=False), effects, threads)
     longer = _longer(rough.model, train, select, sigma, length) if horizon is None else None
@@ -208,14 +212,18 @@ def at_rest(data: Measurements) -> list[str]:
     return [name for name, one, moved in zip(data.columns.qpos, seen, moves) if one and not moved]
 
 
-def _candidates(model: mujoco.MjModel, there: Sequence[Effect], kinds: Sequence[str] | None) -> list[Effect]:
+def _candidates(
+    model: mujoco.MjModel, there: Sequence[Effect], kinds: Sequence[str] | None, exact: bool
+) -> list[Effect]:
     if kinds is not None:
         unknown = [k for k in kinds if k not in LIBRARY]
         if unknown:
             raise ValueError(f"candidates: no effect {unknown[0]!r} is registered; {near(unknown[0], sorted(LIBRARY))}")
     labels = {effect.label for effect in there}
-    found = all_candidates(model, [effect.label for effect in there if isinstance(effect, Declared)])
-    return [e for e in found if e.label not in labels and (kinds is None or e.kind in kinds)]
+    # What is exact is of a simulator, and may have what no machine has.
+    among = LIBRARY if exact and kinds is None else kinds
+    found = all_candidates(model, [effect.label for effect in there if isinstance(effect, Declared)], among)
+    return [e for e in found if e.label not in labels]
 
 
 def _horizon(data: Measurements, touching: bool) -> float:

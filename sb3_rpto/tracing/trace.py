@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.units import units_at
 from sb3_rpto.tracing import wording
-from sb3_rpto.tracing.adequacy import TOLERANCE, Adequacy
+from sb3_rpto.tracing.adequacy import SETTLED
 from sb3_rpto.tracing.cautions import (
     above_noise,
     at_bounds,
@@ -29,6 +29,7 @@ from sb3_rpto.tracing.cautions import (
     unstable,
 )
 from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.conclude import Searched, conclude
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.intervals import FINAL, refit
@@ -37,17 +38,13 @@ from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.misread import misread
 from sb3_rpto.tracing.missing import missing_forces
 from sb3_rpto.tracing.model_checks import doubts
-from sb3_rpto.tracing.origin import may_be_exact, origin
 from sb3_rpto.tracing.prepare import Progress, SetUp, prepare
 from sb3_rpto.tracing.report import Candidate, Report, StandIn, Traced
 from sb3_rpto.tracing.residuals import learnable_share, summary
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.search import Found, find, worth_a_look
 from sb3_rpto.tracing.select import Selection, Selector
-from sb3_rpto.tracing.zeros import Zeros, homed, settled, zeros_by_run
 
-#: Verdicts that leave nothing to look for.
-SETTLED = ("complete", "explained")
 _NEVER = "beside what is kept it lowers the error of unseen windows by nothing clear"
 #: Another effect's typical error that is still as good, as a multiple.
 AS_WELL = 1.1
@@ -81,7 +78,7 @@ def trace(
         that an earlier trace found (``load_corrected(folder).effects``): they are fitted with the declared numbers, and
         nothing asks whether they are needed
     :param seed: of the split, the starts and the resampling
-    :param candidates: kinds of effects to look for; default: all registered ones
+    :param candidates: kinds of effects to look for; default: all that are registered and offered
     :param horizon: length of the windows in s; default: 0.5, or 0.8 where there are less than 15 s of data, shorter
         for short episodes, 0.1 where contacts come and go, and twice that to go on with where what was found leaves
         errors far above the noise
@@ -97,14 +94,14 @@ def trace(
     _check_arguments(data, seed, candidates, horizon, calibrate, threads)
     say = _steady(progress)
 
-    def prepared(data: Measurements, simulated: bool) -> SetUp:
-        return prepare(model, data, declared, seed, candidates, horizon, threads, known, simulated)
+    def prepared(data: Measurements, simulated: bool, kinds: Sequence[str] | None) -> SetUp:
+        return prepare(model, data, declared, seed, kinds, horizon, threads, known, simulated)
 
     def search(on: SetUp) -> Found:
         at, finer = partial(on.selectors, say=say), partial(on.finer, say=say)
         return find(at, finer, on.length, on.longer, seed, calibrate)
 
-    searched = _search(prepared, search, data, simulated, declared, threads, seed, say)
+    searched = conclude(prepared, search, data, declared, candidates, simulated, threads, seed, say)
     set_up, found, first, zeros = searched.set_up, searched.found, searched.first, searched.zeros
     sigma, fitted = set_up.sigma, set_up.fitted
     selector, selection = found.on.fine, found.selection
@@ -181,65 +178,7 @@ def trace(
     )
 
 
-@dataclass(frozen=True)
-class _Searched:
-    """What a search ended with.
-
-    :param set_up: the recordings, as they were read at last
-    :param found: what was found in them
-    :param first: the same before zeros of single runs were taken off
-    :param zeros: encoder zeros that differ by run; None where none do
-    :param verdict: see :func:`judge`
-    """
-
-    set_up: SetUp
-    found: Found
-    first: Found
-    zeros: Zeros | None
-    verdict: str
-
-
-def _search(
-    prepared: Callable[[Measurements, bool], SetUp],
-    search: Callable[[SetUp], Found],
-    data: Measurements,
-    simulated: bool,
-    declared: Sequence[str],
-    threads: int,
-    seed: int,
-    say: Progress,
-) -> _Searched:
-    """Search, and once more where what was found tells that the recordings are of another kind than they looked."""
-    set_up = prepared(data, simulated)
-    found = search(set_up)
-    again = _of_own_steps(set_up, found, declared, threads)
-    if again is not None:
-        set_up = prepared(data, True)
-        found = search(set_up)
-        set_up.findings.append(again)
-    if not _explains(found) and may_be_exact(data):
-        exact = prepared(replace(data, exact=True), simulated)
-        then = search(exact)
-        if _explains(then):
-            set_up, found = exact, then
-            message = "from the model's own steps in time, without noise, as shows with what was found: searched again"
-            set_up.findings.append(Finding("simulated", "fitted runs", message))
-    first = found
-    zeros = zeros_by_run(set_up, found, _explains(found), say, seed)
-    if zeros is not None:
-        without = homed(set_up, zeros)
-        without, refined, then = settled(without, zeros, search(without), say, seed)
-        zeros = refined if then.after.adequate or then.after.ratio < found.after.ratio else None
-    if zeros is not None:
-        set_up, found = without, then
-        set_up.findings.append(zeros.finding())
-    verdict = judge(first.before, found.after, bool(found.selection.model.effects) or zeros is not None)
-    if verdict == "unexplained" and not found.after.ratio < first.before.ratio:
-        found = replace(found, selection=Selection(found.base), after=found.before)  # it is no hint either
-    return _Searched(set_up, found, first, zeros, verdict)
-
-
-def _of_the_search(searched: _Searched) -> list[Finding]:
+def _of_the_search(searched: Searched) -> list[Finding]:
     """How it was searched, where that is not as usual."""
     selector, found = searched.found.on.fine, []
     step, usual = (1e3 * float(s.model.opt.timestep) for s in (selector.simulation, searched.set_up.fine))
@@ -257,7 +196,7 @@ def _of_the_search(searched: _Searched) -> list[Finding]:
 
 
 def _of_the_verdict(
-    searched: _Searched,
+    searched: Searched,
     problem: Problem,
     values: np.ndarray,
     errors: tuple[list[HorizonError], list[HorizonError], list[HorizonError]],
@@ -287,28 +226,6 @@ def _of_the_verdict(
     ]
 
 
-def _explains(found: Found) -> bool:
-    return judge(found.before, found.after, bool(found.selection.model.effects)) in SETTLED
-
-
-def _of_own_steps(set_up: SetUp, found: Found, declared: Sequence[str], threads: int) -> Finding | None:
-    """Whether recordings that were taken for a machine's turn out to be the model's own, now that something is found.
-
-    What is missing errs as much in one kind of steps as in another; with it in the model they can be told apart.
-    """
-    if _explains(found) or not found.selection.model.effects:
-        return None
-    simulation, values = found.on.fine.simulation, found.selection.model.fit.values
-    known = [i for i, e in enumerate(simulation.effects) if e.known and not isinstance(e, Declared)]
-    kept = (*known, *found.selection.model.effects)
-    there = [simulation.effects[i].with_values(values[simulation.slices[i]]) for i in kept]
-    kind = origin(set_up.nominal, set_up.fitted, declared, set_up.sigma, set_up.length, threads, there)
-    if kind == "machine":
-        return None
-    message = "from the model's own steps in time, as shows with what was found first; searched again in such steps"
-    return Finding("simulated", "fitted runs", message)
-
-
 def _steady(progress: Progress | None) -> Progress:
     """Progress that never goes back: steps that come again keep the share that was reached."""
     reached = 0.0
@@ -320,24 +237,6 @@ def _steady(progress: Progress | None) -> Progress:
             progress(reached, what)
 
     return say
-
-
-def judge(before: Adequacy, after: Adequacy, named: bool) -> str:
-    """The verdict from adequacy before and after.
-
-    ``complete``: nothing is missing. ``explained``: what is left with the named effects is no more than noise.
-    ``partly explained``: they at least halve the excess log error (or, where the typical error is no more than noise,
-    the share of windows that are). ``unexplained``: they do not.
-    """
-    if not named:
-        return "complete" if before.adequate else "unexplained"
-    if after.adequate:
-        return "explained"
-    if before.ratio <= 1 + TOLERANCE:  # only stray windows deny that it is complete
-        halved = after.strays <= 0.5 * before.strays
-    else:
-        halved = np.log(max(after.ratio, 1.0)) <= 0.5 * np.log(before.ratio)
-    return "partly explained" if halved else "unexplained"
 
 
 def _check_arguments(

@@ -268,6 +268,8 @@ def _build(
             if data.exact or data.simulated
             else held(e.time, e.ctrl, np.append(grid, grid[-1] + h) - half_step(model))
         )
+        if data.idle and not e.after_gap:
+            commands[w][grid < e.time[0] - 1e-6 * h] = 0
         enabled[w][:, actuators] = e.enabled[row[before:]]
         n = end - begin - 1
         at[w, :n] = np.minimum((e.time[begin + 1 : end] - t0) / h, steps)

@@ -89,6 +89,19 @@ def test_an_undeclared_effect_is_named_added_and_fitted() -> None:
     assert values["pole.length"] == pytest.approx(LENGTH * 0.6, rel=0.01)
 
 
+def test_a_target_with_frictionloss_alone_is_explained(soon: None) -> None:
+    """Nobody who sets it by hand makes it hold as a machine's does."""
+    shifted = target([])
+    shifted.unwrapped.model.dof_frictionloss[0] = LEVEL  # type: ignore[attr-defined]
+    made = model([], target_env=shifted, close_loop=[*KINDS, "soft_friction"]).learn(81, source_timesteps=4)
+    assert made.loop is not None
+    report: Report = made.loop.reports[0]
+    assert report.verdict == "explained"
+    assert [traced.effect.label for traced in report.effects] == ["soft_friction(slider)"]
+    assert dynamics(made).describe()["soft_friction(slider).level"] == pytest.approx(LEVEL, rel=1e-3)
+    assert dynamics(made).error(made.transitions("target")) < 1e-3, "the simulator gives way as the target does"
+
+
 def test_a_trace_is_logged_before_any_episode_ends(soon: None, tmp_path: Path) -> None:
     made = filled([])
     made.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))

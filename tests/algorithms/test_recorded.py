@@ -333,6 +333,13 @@ def test_a_log_that_corrects_the_simulator_alone_is_not_asked_for_again(tmp_path
     assert loaded.learn(20, reset_num_timesteps=False).num_timesteps == 40
 
 
+def test_a_log_that_is_too_short_to_trace_is_named_before_anything_is_learned() -> None:
+    made = model(log(episodes=1, decisions=12))
+    with pytest.raises(ValueError, match=r"^target_data: .*too few to select on; record longer"):
+        made.learn(8)
+    assert made.num_timesteps == 0
+
+
 def test_with_the_loop_open_the_declared_numbers_alone_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
     fits: list[int] = []
     monkeypatch.setattr(PhysicalDynamics, "fit", lambda *_, **__: fits.append(1))

@@ -68,6 +68,9 @@ def test_all_at_all_places() -> None:
         assert f"{kind}(motor)" in got
     assert {label for label in got if label.startswith("payload")} == {"payload(cart)", "payload(pole)"}
     assert {label for label in got if label.startswith("link_length")} == {"link_length(pole)"}
+    assert not [label for label in got if label.startswith("soft_friction")], "it is no machine's"
+    named = candidates(model(), ["slide.frictionloss"], ["soft_friction", "command_delay"])
+    assert {e.label for e in named} == {"soft_friction(joint1)", "command_delay(motor)"}
     assert {label for label in got if label.startswith("geom_friction")} == {
         "geom_friction(floor)",
         "geom_friction(box)",

@@ -86,6 +86,7 @@ def motor_limit(q: np.ndarray, v: np.ndarray, m: np.ndarray, inverse_stall: floa
 
 ROWS = {
     "coulomb_friction": Row("shoulder", {"level": 0.6}, {"level": 0.1}, dry(lambda q, v, m, level: level)),
+    "soft_friction": Row("elbow", {"level": 0.3}, {"level": 0.1}),
     "stribeck_friction": Row(
         "elbow",
         {"extra": 0.3, "level": 0.2, "speed": 0.5},

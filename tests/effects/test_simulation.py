@@ -241,6 +241,17 @@ def test_dry_friction_on_a_smooth_joint_is_the_stiff_one_from_nothing_on(kind: s
         assert 0 < np.abs(a - b).max() < 1e-6
 
 
+@pytest.mark.parametrize("joint", [0, 1], ids=["shoulder", "elbow"])
+def test_soft_friction_is_frictionloss_alone_bit_for_bit(joint: int) -> None:
+    qpos, qvel, commands = start(3)
+    model = MODEL.__copy__()
+    model.dof_frictionloss[joint] += 0.25
+    sim = Simulation(MODEL, [LIBRARY["soft_friction"](("shoulder", "elbow")[joint], level=0.25)], 1)
+    assert equal(
+        sim.rollout(np.tile(sim.values(), (3, 1)), qpos, qvel, Drive(commands)), loop(model, qpos, qvel, commands)
+    )
+
+
 def test_spring_adds_to_the_models_own() -> None:
     qpos, qvel, commands = start(2)
     model = MODEL.__copy__()

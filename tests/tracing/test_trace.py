@@ -24,9 +24,8 @@ from sb3_rpto.effects.friction import CoulombFriction, ViscousFriction
 from sb3_rpto.effects.library import given
 from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Measurements, Report, trace
-from sb3_rpto.tracing.adequacy import Adequacy
+from sb3_rpto.tracing.adequacy import Adequacy, judge
 from sb3_rpto.tracing.prepare import LONGER, SetUp, prepare
-from sb3_rpto.tracing.trace import judge
 
 #: the longest steps that the recording and the trace may have
 COARSE = PENDULUM.replace('timestep="0.005"', 'timestep="0.01"')

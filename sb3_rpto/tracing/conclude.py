@@ -1,0 +1,142 @@
+"""From recordings to what is found in them, searched again where that tells that they are of another kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from sb3_rpto.effects import LIBRARY, Declared
+from sb3_rpto.tracing.adequacy import SETTLED, TOLERANCE, judge
+from sb3_rpto.tracing.cautions import DRY, WORSE, creeping
+from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.origin import may_be_exact, origin
+from sb3_rpto.tracing.prepare import Progress, SetUp
+from sb3_rpto.tracing.search import Found
+from sb3_rpto.tracing.select import Selection
+from sb3_rpto.tracing.zeros import Zeros, homed, settled, zeros_by_run
+
+#: Dry friction that may give way is looked for where it leaves less than this share of the error.
+SOFTER = 0.5
+#: Recordings, whether they are of a simulator's own steps, and the kinds of effects to look for.
+Prepared = Callable[[Measurements, bool, Sequence[str] | None], SetUp]
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What a search ended with.
+
+    :param set_up: the recordings, as they were read at last
+    :param found: what was found in them
+    :param first: the same before zeros of single runs were taken off
+    :param zeros: encoder zeros that differ by run; None where none do
+    :param verdict: see :func:`sb3_rpto.tracing.adequacy.judge`
+    """
+
+    set_up: SetUp
+    found: Found
+    first: Found
+    zeros: Zeros | None
+    verdict: str
+
+
+def conclude(
+    prepared: Prepared,
+    search: Callable[[SetUp], Found],
+    data: Measurements,
+    declared: Sequence[str],
+    kinds: Sequence[str] | None,
+    simulated: bool,
+    threads: int,
+    seed: int,
+    say: Progress,
+) -> Searched:
+    """Search, and once more where what was found tells that the recordings are of another kind than they looked.
+
+    :param prepared: reads recordings as of a kind
+    :param search: in what was read
+    :param data: recordings
+    :param declared: names of the parameters that are fitted
+    :param kinds: of effects to look for; None: all that are offered
+    :param simulated: whether ``data`` are known to be of the model's own steps in time
+    :param threads: that simulate
+    :param seed: of the resampling
+    :param say: progress
+    """
+    softer = _softer(kinds)
+
+    def read(data: Measurements, simulated: bool) -> tuple[SetUp, Found]:
+        set_up = prepared(data, simulated, kinds)
+        found = search(set_up)
+        if softer and _creeps(found):
+            soft = prepared(data, simulated, softer)
+            then = search(soft)
+            if _explains(then) or then.after.ratio < found.after.ratio:
+                message = "dry friction gives way near rest, as MuJoCo's frictionloss alone does and a machine's hardly"
+                soft.findings.append(Finding("soft friction", "fitted runs", message))
+                return soft, then
+        return set_up, found
+
+    set_up, found = read(data, simulated)
+    again = _of_own_steps(set_up, found, declared, threads)
+    if again is not None:
+        simulated = True
+        set_up, found = read(data, simulated)
+        set_up.findings.append(again)
+    if not _explains(found) and may_be_exact(data):
+        exact, then = read(replace(data, exact=True), simulated)
+        if _explains(then):
+            set_up, found = exact, then
+            message = "from the model's own steps in time, without noise, as shows with what was found: searched again"
+            set_up.findings.append(Finding("simulated", "fitted runs", message))
+    first = found
+    zeros = zeros_by_run(set_up, found, _explains(found), say, seed)
+    if zeros is not None:
+        without = homed(set_up, zeros)
+        without, refined, then = settled(without, zeros, search(without), say, seed)
+        zeros = refined if then.after.adequate or then.after.ratio < found.after.ratio else None
+    if zeros is not None:
+        set_up, found = without, then
+        set_up.findings.append(zeros.finding())
+    verdict = judge(first.before, found.after, bool(found.selection.model.effects) or zeros is not None)
+    if verdict == "unexplained" and not found.after.ratio < first.before.ratio:
+        found = replace(found, selection=Selection(found.base), after=found.before)  # it is no hint either
+    return Searched(set_up, found, first, zeros, verdict)
+
+
+def _explains(found: Found) -> bool:
+    return judge(found.before, found.after, bool(found.selection.model.effects)) in SETTLED
+
+
+def _creeps(found: Found) -> bool:
+    """Whether dry friction that was found leaves what it would not if it gave way at rest."""
+    if _explains(found):
+        return False
+    model = found.selection.model
+    share = creeping(found.on.fine.every_window(), model.fit.values, model.effects)[1]
+    return share < SOFTER or (share < 1 - WORSE and share * found.after.ratio <= 1 + TOLERANCE)
+
+
+def _softer(kinds: Sequence[str] | None) -> list[str]:
+    """The same kinds of effects, with friction that gives way in the place of the dry ones; none without those."""
+    kinds = kinds if kinds is not None else [name for name, kind in LIBRARY.items() if kind.offered]
+    others = [kind for kind in kinds if kind not in DRY]
+    return [*others, "soft_friction"] if len(others) < len(kinds) else []
+
+
+def _of_own_steps(set_up: SetUp, found: Found, declared: Sequence[str], threads: int) -> Finding | None:
+    """Whether recordings that were taken for a machine's turn out to be the model's own, now that something is found.
+
+    What is missing errs as much in one kind of steps as in another; with it in the model they can be told apart.
+    """
+    if _explains(found) or not found.selection.model.effects:
+        return None
+    simulation, values = found.on.fine.simulation, found.selection.model.fit.values
+    known = [i for i, e in enumerate(simulation.effects) if e.known and not isinstance(e, Declared)]
+    kept = (*known, *found.selection.model.effects)
+    there = [simulation.effects[i].with_values(values[simulation.slices[i]]) for i in kept]
+    kind = origin(set_up.nominal, set_up.fitted, declared, set_up.sigma, set_up.length, threads, there)
+    if kind == "machine":
+        return None
+    message = "from the model's own steps in time, as shows with what was found first; searched again in such steps"
+    return Finding("simulated", "fitted runs", message)
