@@ -79,7 +79,12 @@ class Steps:
 
 
 def as_steps(
-    data: Transitions, recover: StateMap, model: mujoco.MjModel, frame_skip: int, chosen: np.ndarray | None = None
+    data: Transitions,
+    recover: StateMap,
+    model: mujoco.MjModel,
+    frame_skip: int,
+    chosen: np.ndarray | None = None,
+    idle: bool = False,
 ) -> Steps:
     """Transitions as simulator steps; those with an unknown state (a speed at the observation's bound) are left out.
 
@@ -88,6 +93,7 @@ def as_steps(
     :param model: the simulator's
     :param frame_skip: simulation steps in one transition
     :param chosen: ascending rows that become steps, of the others only the commands count; None: all
+    :param idle: whether zeros were sent before an episode's first command, see :class:`~sb3_rpto.effects.Effect`
     """
     earlier = remembered(model, frame_skip)
     chosen = np.arange(len(data)) if chosen is None else chosen
@@ -100,7 +106,7 @@ def as_steps(
     rows = chosen[kept]
     commands = np.clip(actions, *command_limits(model))
     before = predecessors(observations, next_observations)
-    drive = np.repeat(_history(commands, before, rows, earlier), frame_skip, axis=1)
+    drive = np.repeat(_history(commands, before, rows, earlier, idle), frame_skip, axis=1)
     begun, reached = (np.nan_to_num(np.concatenate([s.qpos, s.qvel], axis=1))[kept] for s in (now, then))
     turned = list(now.wrapped)
     # The simulator counts whole turns on from where it begins; an observed angle jumps by one.
@@ -123,18 +129,20 @@ def _known_at_rest(recover: StateMap) -> np.ndarray:
     return np.concatenate([rest.known_qpos[0], rest.known_qvel[0]])
 
 
-def _history(commands: np.ndarray, before: np.ndarray, rows: np.ndarray, earlier: int) -> np.ndarray:
+def _history(commands: np.ndarray, before: np.ndarray, rows: np.ndarray, earlier: int, idle: bool) -> np.ndarray:
     """The commands of the transitions at ``rows`` and of those before, (len(rows), earlier + 1, nu), oldest first.
 
-    Before an episode's first transition the first command is taken to have held.
+    Before an episode's first transition come zeros where it was ``idle``, else the first command is taken to have held.
 
     :param commands: of all transitions, (n, nu)
     :param before: see :func:`sb3_rpto.dynamics.base.predecessors`
     """
-    past, history = rows, [commands[rows]]
+    past, sent, history = rows, np.ones((len(rows), 1)), [commands[rows]]
     for _ in range(earlier):
-        past = np.where(before[past] >= 0, before[past], past)
-        history.insert(0, commands[past])
+        first = before[past] < 0
+        sent[first & idle] = 0
+        past = np.where(first, past, before[past])
+        history.insert(0, sent * commands[past])
     return np.stack(history, axis=1)
 
 

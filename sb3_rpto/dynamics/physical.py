@@ -261,6 +261,7 @@ class PhysicalDynamics(Dynamics):
         for q, v, action in zip(qpos, qvel, actions.cpu().numpy()):
             twin.reset()
             base.set_state(q, v)  # type: ignore[attr-defined]
+            twin.forget_commands()
             observation, reward, terminated, _, _ = twin.step(action)
             following.append(observation)
             rewards.append(float(reward))
@@ -289,7 +290,8 @@ class PhysicalDynamics(Dynamics):
         return relative_error(predicted, Transitions(before, before, before, after, before))
 
     def _steps(self, data: Transitions, chosen: np.ndarray | None = None) -> Steps:
-        return as_steps(data, self.recover, self.model, self.frame_skip, chosen)
+        idle = any(effect.idle for effect in self.simulation.effects)
+        return as_steps(data, self.recover, self.model, self.frame_skip, chosen, idle)
 
     # ------------------------------------------------------------------ the fit
 

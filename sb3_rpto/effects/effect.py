@@ -97,6 +97,9 @@ class Effect:
     asks_simulator: bool = False
     #: whether the model has it from the start: fitted like the others, and nothing asks whether it is needed
     known: bool = False
+    #: of a late command: whether an environment's episodes begin as if zeros had been sent before, as after a reset that
+    #: empties a queue of commands; else as if the first command had held
+    idle: bool = False
 
     def __init__(self, on: str = "", **values: float) -> None:
         names = [p.name for p in self.parameters]
@@ -122,7 +125,9 @@ class Effect:
         """The same effect with other parameters, (p,), clipped to their bounds."""
         low, high = ([getattr(p, bound) for p in self.parameters] for bound in ("lower", "upper"))
         clipped = np.clip(values, low, high)
-        return type(self)(self.on, **{p.name: float(v) for p, v in zip(self.parameters, clipped)})
+        made = type(self)(self.on, **{p.name: float(v) for p, v in zip(self.parameters, clipped)})
+        made.idle = self.idle
+        return made
 
     def as_known(self) -> Effect:
         """The same effect, :attr:`known` to be there: its nulls are its values, where fits begin.
@@ -217,6 +222,13 @@ class Effect:
         """The inverse of :meth:`observe`."""
         return q, v
 
+    def begin(self, x: np.ndarray, dt: float) -> dict[str, Any]:
+        """The memory of :meth:`command` at the beginning of an episode, for parameters (n, p)."""
+        memory: dict[str, Any] = {}
+        if self.idle:
+            self.command(np.zeros(len(x)), x, memory, dt)
+        return memory
+
     def late(self, x: np.ndarray) -> np.ndarray:
         """How old in s, (...,) of ``x`` (..., p), what the joint's sensor shows is: position and velocity of then.
 
@@ -243,7 +255,8 @@ class Effect:
 
     def to_json(self) -> dict[str, Any]:
         """Kind, place and values, from which :func:`from_json` makes it again bit for bit."""
-        return {"kind": self.kind, "on": self.on, "values": dict(zip([p.name for p in self.parameters], self.values))}
+        values = dict(zip([p.name for p in self.parameters], self.values))
+        return {"kind": self.kind, "on": self.on, "values": values, **({"idle": True} if self.idle else {})}
 
 
 #: Every known effect by kind; :func:`register` adds to it.
@@ -287,4 +300,6 @@ def from_json(stored: Mapping[str, Any]) -> Effect:
         )
     if stored["kind"] not in LIBRARY:
         raise ValueError(f"no effect {stored['kind']!r} is registered; {near(stored['kind'], LIBRARY)}")
-    return LIBRARY[stored["kind"]](stored["on"], **stored["values"])
+    made = LIBRARY[stored["kind"]](stored["on"], **stored["values"])
+    made.idle = bool(stored.get("idle", False))
+    return made

@@ -146,8 +146,13 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; commands from before it are forgotten."""
-        self._memory, self._past = [{} for _ in self._commanding], []
+        step = float(self._world.model.opt.timestep)
+        self._memory, self._past = [effect.begin(x, step) for effect, x in self._commanding], []
         return self.env.reset(seed=seed, options=options)
+
+    def forget_commands(self) -> None:
+        """Go on as if the next command had been sent all along."""
+        self._memory = [{} for _ in self._commanding]
 
     def render(self) -> Any:
         """The wrapped environment's picture.

@@ -126,6 +126,8 @@ def trace(
     rounding = data.exact and found.after.adequate  # is all that is left
     floor = noise_floor(simulation, final, data, sigma, seed)
     kept = _kept(selection, simulation, final, intervals, selector.limit(selection.model), seed)
+    for traced in kept:
+        traced.effect.idle = fitted.idle and traced.effect.overrides("command") and traced.effect.remembers
     if searched.verdict in SETTLED and found.screening is not None:
         likes = Likes(selector, found.screening)
         fit = problem.score(final)

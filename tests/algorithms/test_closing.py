@@ -102,6 +102,30 @@ def test_a_target_with_frictionloss_alone_is_explained(soon: None) -> None:
     assert dynamics(made).error(made.transitions("target")) < 1e-3, "the simulator gives way as the target does"
 
 
+class Queue(gym.Wrapper):
+    """Sends each action one step late, and zeros first: what such wrappers do."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.queue = [np.zeros(1)]
+        return self.env.reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        self.queue.append(action)
+        return self.env.step(self.queue.pop(0))
+
+
+def test_a_target_that_queues_actions_is_met_from_the_first_step_of_an_episode_on(soon: None, tmp_path: Path) -> None:
+    made = model([], target_env=Queue(target([])), close_loop=["command_delay", "torque_offset"])
+    made.learn(81, source_timesteps=4)
+    data = made.transitions("target")
+    assert data.terminations.sum() > 5
+    assert dynamics(made).describe()["command_delay(slide).delay"] == pytest.approx(0.05, rel=1e-3)
+    assert dynamics(made).error(data) < 1e-3
+    made.save(tmp_path / "late")
+    again = RPTO.load(tmp_path / "late", env=gym.make(TASK), target_env=Queue(target([])))
+    assert dynamics(again).error(data) == dynamics(made).error(data)
+
+
 def test_a_trace_is_logged_before_any_episode_ends(soon: None, tmp_path: Path) -> None:
     made = filled([])
     made.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))

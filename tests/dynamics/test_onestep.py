@@ -73,6 +73,20 @@ def test_true_effects_reach_what_the_target_reached(effects):
     assert missed(steps, sim, sim.null) > 1e-3
 
 
+def test_before_an_episode_an_idle_queue_held_zeros():
+    late = CommandDelay("slide", delay=0.087)
+    late.idle = True
+    data = collect(shifted(POLES, {}, [late]), 60)
+    env, sim = gym.make(POLES), simulation(POLES, [], [late])
+    idle, held = (
+        as_steps(data, state_map(env), env.unwrapped.model, env.unwrapped.frame_skip, idle=there)
+        for there in (True, False)
+    )
+    assert data.terminations.sum() > 3
+    assert missed(idle, sim, late.values) < 1e-9
+    assert missed(held, sim, late.values) > 1e-3
+
+
 @pytest.mark.parametrize("beside", [[], [SensorGain("hinge2", change=0.1)]], ids=["alone", "after a gain"])
 def test_a_late_sensor_is_carried_on_to_the_present(beside):
     """To second order, by the speed it gained: the other joint, which it drives, then moves as it did."""

@@ -14,6 +14,7 @@ from stable_baselines3 import SAC
 
 from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales, Simulation
 from sb3_rpto.effects.commands import CommandDelay
+from sb3_rpto.effects.effect import from_json
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
 from sb3_rpto.effects.model import load_model, numbers
 from sb3_rpto.effects.names import object_names
@@ -590,3 +591,41 @@ def test_the_models_own_sensors_err_as_well(tmp_path):
         np.testing.assert_allclose(seen, np.array([0.3, 0.0]) + expected, atol=1e-12)
     np.testing.assert_array_equal(biased.unwrapped.data.qpos, true.data.qpos)
     np.testing.assert_array_equal(biased.unwrapped.data.sensordata, true.data.sensordata)
+
+
+class Queue(gym.Wrapper):
+    """Sends each action one step late, and zeros first: what such wrappers do."""
+
+    def reset(self, **kwargs):
+        self.queue = [np.zeros(self.action_space.shape)]
+        return self.env.reset(**kwargs)
+
+    def step(self, action):
+        self.queue.append(action)
+        return self.env.step(self.queue.pop(0))
+
+
+def test_an_idle_delay_is_a_queue_of_actions_that_is_empty_at_a_reset():
+    env = gym.make(POLE)
+    late = CommandDelay("slide", delay=env.unwrapped.dt)
+    late.idle = True
+    envs = [Queue(gym.make(POLE)), CorrectedEnv(env, [late])]
+    action = np.array([0.4])
+    for seed in (0, 1):
+        assert np.array_equal(*(e.reset(seed=seed)[0] for e in envs))
+        for _ in range(4):
+            first, second = (e.step(action)[0] for e in envs)
+            np.testing.assert_allclose(first, second, rtol=0, atol=1e-12)
+    envs[1].reset(seed=0)
+    envs[1].forget_commands()
+    plain = gym.make(POLE)
+    plain.reset(seed=0)
+    np.testing.assert_allclose(envs[1].step(action)[0], plain.step(action)[0], rtol=0, atol=1e-12)
+
+
+def test_what_is_idle_stays_so_with_other_values_and_as_json():
+    late = CommandDelay("slide", delay=0.05)
+    assert "idle" not in late.to_json()
+    late.idle = True
+    for made in (late.with_values(np.array([0.1])), late.as_known(), from_json(late.to_json()), copy.deepcopy(late)):
+        assert made.idle

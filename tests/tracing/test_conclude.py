@@ -1,10 +1,17 @@
-"""Searches that begin again as recordings turn out to be of another kind: of friction that gives way."""
+"""What recordings turn out to be of: friction that gives way, queues of commands that are empty at a reset."""
 
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
 import pytest
 from simulated import compiled, recorded
+from stable_baselines3 import SAC
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto.effects import LIBRARY
-from sb3_rpto.tracing import conclude, trace
+from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.tracing import Measurements, conclude, trace
 
 OWN = """<mujoco><option timestep="0.005"/><worldbody><body name="pole">
 <joint name="hinge" axis="0 -1 0" damping="0.05"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="0.5"/>
@@ -29,3 +36,44 @@ def test_friction_that_gives_way_is_not_looked_for_where_no_dry_one_is(monkeypat
     report = trace(OWN, data, ["pole.mass"], candidates=["torque_offset"], simulated=True, threads=1)
     assert report.verdict == "unexplained"
     assert [c.label for c in report.candidates] == ["torque_offset(hinge)"]
+
+
+class Queue(gym.Wrapper):
+    """Sends each action one step late, and zeros first."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.queue = [np.zeros_like(self.action_space.sample())]
+        return self.env.reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        self.queue.append(action)
+        return self.env.step(self.queue.pop(0))
+
+
+@pytest.mark.parametrize("lacks", ["a queue", "a late command", "nothing"])
+def test_what_came_before_a_run_is_told_by_its_first_steps(lacks: str) -> None:
+    source, name = gym.make("InvertedDoublePendulum-v5"), "slide"
+    target = gym.make("InvertedDoublePendulum-v5")
+    delay = source.unwrapped.dt  # type: ignore[attr-defined]
+    if lacks == "a queue":
+        target = Queue(target)
+    elif lacks == "a late command":
+        target = apply_effects(target, [LIBRARY["command_delay"](name, delay=delay)])
+    agent = SAC("MlpPolicy", Monitor(target), buffer_size=120, learning_starts=120, seed=0, device="cpu").learn(120)
+    assert agent.replay_buffer is not None
+    data = Measurements.from_replay(agent.replay_buffer, source)
+    assert len(data.episodes) > 10, "many of the steps are first ones"
+    report = trace(source, data, ["pole.length"], candidates=["command_delay", "torque_offset"], threads=1)
+    assert report.verdict == ("complete" if lacks == "nothing" else "explained")
+    assert [(t.label, t.effect.idle) for t in report.effects] == (
+        [] if lacks == "nothing" else [(f"command_delay({name})", lacks == "a queue")]
+    )
+    assert [t.effect.values[0] for t in report.effects] == pytest.approx([delay] * len(report.effects), rel=1e-3)
+    assert [f.kind for f in report.findings].count("idle start") == (lacks == "a queue")
+    corrected = report.apply(gym.make("InvertedDoublePendulum-v5"))
+    for seed in (3, 4):
+        seen = [env.reset(seed=seed)[0] for env in (target, corrected)]
+        np.testing.assert_allclose(*seen, rtol=0, atol=1e-9)
+        for action in (0.3, -0.2, 0.1):
+            seen = [env.step(np.array([action], dtype=np.float32))[0] for env in (target, corrected)]
+            np.testing.assert_allclose(*seen, rtol=0, atol=1e-5)
