@@ -135,6 +135,29 @@ class GravityTilt(Effect):
 
 
 @register
+class GravityScale(Effect):
+    r"""Gravity of another strength, :math:`g' = (1 + c)\,g`, as in simulated worlds: MuJoCo's ``option gravity``."""
+
+    kind = "gravity_scale"
+    place = "world"
+    parameters = (Parameter("change", "", 0.03, lower=-1.0, upper=9.0),)
+    equation = "g' = (1 + change) g"
+    native = "option gravity"
+    excite = "poses at which gravity pulls differently"
+    same = ("gravity",)
+    offered = False
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """The world, where there is gravity."""
+        return GravityTilt.places(model)
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Scale gravity."""
+        world.field("opt.gravity")[:] *= 1 + x
+
+
+@register
 class Wind(Effect):
     r"""A steady wind, :math:`w' = w + (x, y, z)` in the world's frame: MuJoCo's ``option wind``.
 

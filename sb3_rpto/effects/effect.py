@@ -97,7 +97,7 @@ class Effect:
     asks_simulator: bool = False
     #: whether the model has it from the start: fitted like the others, and nothing asks whether it is needed
     known: bool = False
-    #: of a late command: whether an environment's episodes begin as if zeros had been sent before, as after a reset that
+    #: of a late command: whether an environment's episodes begin as if zeros had been sent before, as where a reset
     #: empties a queue of commands; else as if the first command had held
     idle: bool = False
 

@@ -149,6 +149,7 @@ ROWS = {
     "payload": Row("lower", {"mass": 0.3, "along": 1.6}, {"mass": 0.1, "along": 1.0}),
     "armature": Row("elbow", {"inertia": 0.02}, {"inertia": 0.005}),
     "link_length": Row("lower", {"change": 0.12}, {"change": 0.0}),
+    "gravity_scale": Row("", {"change": -0.3}, {"change": 0.0}),
     "gravity_tilt": Row("", {"x": 0.08, "y": -0.05}, {"x": 0.0, "y": 0.0}),
     "wind": Row("", {"x": 2.0, "y": -1.5, "z": 1.0}, {"x": 0.0, "y": 0.0, "z": 0.0}),
     "fluid": Row("", {"density": 150.0, "viscosity": 0.5}, {"density": 30.0, "viscosity": 0.1}),
@@ -440,6 +441,14 @@ def test_fluid_and_wind_drag_the_inertia_box() -> None:
     f = -2 * rho * rj * rk * abs(v) * v - 6 * np.pi * beta * r.mean() * v
     g = -0.5 * rho * r * (rj**4 + rk**4) * abs(w) * w - 8 * np.pi * beta * r.mean() ** 3 * w
     np.testing.assert_allclose((got - qvel) / 0.001, np.concatenate([f / 2, g / inertia]), rtol=1e-9, atol=1e-9)
+
+
+def test_another_gravity_is_the_options() -> None:
+    def halve(m: mujoco.MjModel) -> None:
+        m.opt.gravity[:] *= 0.5
+
+    got = one_step(ARM, [LIBRARY["gravity_scale"](change=-0.5)])
+    np.testing.assert_array_equal(got, one_step(edited(ARM, halve), []))
 
 
 def test_tilt_turns_gravity() -> None:
