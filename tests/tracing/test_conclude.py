@@ -77,3 +77,13 @@ def test_what_came_before_a_run_is_told_by_its_first_steps(lacks: str) -> None:
         for action in (0.3, -0.2, 0.1):
             seen = [env.step(np.array([action], dtype=np.float32))[0] for env in (target, corrected)]
             np.testing.assert_allclose(*seen, rtol=0, atol=1e-5)
+
+
+def test_another_gravity_is_found_in_the_states_of_a_simulator_where_nothing_is_declared() -> None:
+    source, target = gym.make("rpto/InvertedDoublePendulum-v0"), gym.make("rpto/InvertedDoublePendulum-gravity-x0.5-v0")
+    agent = SAC("MlpPolicy", Monitor(target), buffer_size=150, learning_starts=150, seed=0, device="cpu").learn(150)
+    assert agent.replay_buffer is not None
+    report = trace(source, Measurements.from_replay(agent.replay_buffer, source), threads=1)
+    assert report.verdict == "explained"
+    assert [traced.label for traced in report.effects] == ["gravity_scale"]
+    assert report.effects[0].effect.values == pytest.approx([-0.5], abs=1e-4)
