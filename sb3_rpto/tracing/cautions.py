@@ -295,6 +295,15 @@ def encoder_zeros(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Findin
     return found
 
 
+def idle_start(late: Sequence[Effect]) -> list[Finding]:
+    """What is late acts on zeros when a run begins, see :func:`sb3_rpto.tracing.origin.idle`.
+
+    :param late: effects that are so
+    """
+    message = "the runs begin as if zeros had been sent before, and so do episodes of the corrected simulator"
+    return [Finding("idle start", ", ".join(e.label for e in late), message)] if late else []
+
+
 def brief_delays(named: Sequence[Effect], step: float) -> list[Finding]:
     """Delays that are small beside the time between two samples: time stamps and steps in time look like them.
 

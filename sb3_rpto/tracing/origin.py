@@ -27,9 +27,8 @@ CLEARLY, SOMEWHAT = 0.5, 0.8
 #: They may be exact where their noise is less than this share of what exact ones count as noisy by.
 NOISELESS = 0.03
 
-#: Nothing was commanded before the runs where their first steps err by less than this share of what they do with their
-#: own commands, if those come at once.
-IDLE = 0.75
+#: Nothing was commanded before the runs where less than this share of their first commands arrives in the first step.
+ARRIVES = 0.75
 
 Origin: TypeAlias = Literal["machine", "simulated", "exact"]
 
@@ -45,9 +44,10 @@ def may_be_exact(data: Measurements) -> bool:
 
 
 def idle(simulation: Simulation, data: Measurements, sigma: np.ndarray) -> bool:
-    """Whether runs of a simulator seem to begin without a command: their first steps go rather as with none.
+    """Whether runs of a simulator seem to begin without a command: not all of the first one acts in the first step.
 
-    So they do where a queue of commands is empty at a reset. Where nothing is late, what was before does not matter.
+    So it is where a queue of commands is empty at a reset, or a filter at rest. Where nothing is late, as in a weak
+    motor, what was before does not matter.
 
     :param simulation: of the model
     :param data: to fit to
@@ -60,19 +60,20 @@ def idle(simulation: Simulation, data: Measurements, sigma: np.ndarray) -> bool:
         windows = cut(simulation.model, replace(data, episodes=beginnings), sigma, 2 * data.step, len(beginnings))
     except ValueError:  # none of their states is known
         return False
-    steps = windows.at[:, 0].astype(int)
-    rows, moved = np.arange(len(windows)), windows.measured[:, 0] - windows.qpos[:, windows.columns]
+    steps, rows = windows.at[:, 0].astype(int), np.arange(len(windows))
     values = np.tile(simulation.null, (len(windows), 1))
 
-    def error(share: float) -> float:
+    def reached(share: float) -> np.ndarray:
         commands = windows.drive.commands.copy()
         commands[:, windows.drive.before :] *= share
         drive = windows.drive._replace(commands=commands)
         qpos, _ = simulation.rollout(values, windows.qpos, windows.qvel, drive)
-        missed = qpos[rows, steps][:, windows.columns] - windows.measured[:, 0]
-        return float(np.median(np.abs(missed / np.maximum(moved.std(axis=0), windows.sigma)).sum(axis=1)))
+        return np.asarray(qpos[rows, steps][:, windows.columns] / windows.sigma)
 
-    return error(0.0) < IDLE * error(1.0)
+    none = reached(0.0)
+    gained, seen = reached(1.0) - none, windows.measured[:, 0] / windows.sigma - none
+    arrives = (gained * seen).sum(axis=1) / np.maximum((gained**2).sum(axis=1), 1e-12)
+    return bool(np.median(arrives) < ARRIVES)
 
 
 def origin(

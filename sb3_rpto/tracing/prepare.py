@@ -188,8 +188,6 @@ def prepare(
     fine = Simulation(nominal, effects, threads)
     if (data.exact or data.simulated) and idle(fine, fitted, sigma):
         train, select, test, fitted = (replace(d, idle=True) for d in (train, select, test, fitted))
-        message = "the first steps go as without a command: what is late has none to act on then"
-        findings.append(Finding("idle start", "fitted runs", message))
     scales = typical(fine, force_residuals(fine, fine.null, fitted)).scales(effects)
     rough = Simulation(discretised(compiled, fitted, fine=False), effects, threads)
     longer = _longer(rough.model, train, select, sigma, length) if horizon is None else None

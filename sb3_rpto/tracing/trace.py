@@ -19,6 +19,7 @@ from sb3_rpto.tracing.cautions import (
     brief_delays,
     encoder_zeros,
     finer_steps,
+    idle_start,
     missed,
     no_nearer,
     own_steps,
@@ -126,8 +127,9 @@ def trace(
     rounding = data.exact and found.after.adequate  # is all that is left
     floor = noise_floor(simulation, final, data, sigma, seed)
     kept = _kept(selection, simulation, final, intervals, selector.limit(selection.model), seed)
-    for traced in kept:
-        traced.effect.idle = fitted.idle and traced.effect.overrides("command") and traced.effect.remembers
+    late = [t.effect for t in kept if fitted.idle and t.effect.overrides("command") and t.effect.remembers]
+    for effect in late:
+        effect.idle = True
     if searched.verdict in SETTLED and found.screening is not None:
         likes = Likes(selector, found.screening)
         fit = problem.score(final)
@@ -141,6 +143,7 @@ def trace(
         *at_bounds(problem, final),
         *strays(selector, final, set_up, found.after, seed),
         *encoder_zeros(simulation.model, [traced.effect for traced in kept]),
+        *idle_start(late),
         *brief_delays([traced.effect for traced in kept], fitted.step),
         *unstable(problem, before.values, final),
     ]
