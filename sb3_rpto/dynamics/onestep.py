@@ -17,8 +17,8 @@ from sb3_rpto.effects.sensors import ago
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.envs.observations import StateMap
 
-#: Commands from before a transition, for delays and filters, in s.
-MEMORY = 0.2
+#: Commands from before a transition, for delays and filters, in s, and at least of so many transitions.
+MEMORY, FILTERED = 0.2, 10
 #: Finite differences, in the parameters' scales: wide ones see over the kinks of contacts, narrow ones see the slope.
 DIFFERENCES = (1e-2, 1e-3, 1e-4)
 #: Shares of the trusted size that a step may have.
@@ -119,7 +119,7 @@ def as_steps(
 
 def remembered(model: mujoco.MjModel, frame_skip: int) -> int:
     """Transitions before one whose commands may still act in it."""
-    return -(-round(MEMORY / float(model.opt.timestep)) // frame_skip)
+    return max(FILTERED, -(-round(MEMORY / float(model.opt.timestep)) // frame_skip))
 
 
 def _known_at_rest(recover: StateMap) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What happens to a command on its way to the actuator, in this order: delay, deadband, saturation, play, lag.
+"""What happens to a command on its way to the actuator, in order: smoothing, delay, deadband, saturation, play, lag.
 
 A wrong gain comes last of all, in the actuator itself.
 """
@@ -14,6 +14,39 @@ from sb3_rpto.effects.world import World
 
 LONGEST_DELAY = 0.2  # s; a longer delay is a fault of the log
 _SLOWEST = 0.25  # s; of a slower lag the past that windows keep says too little
+
+
+@register
+class CommandSmoothing(Effect):
+    r"""Exponential smoothing of what is sent, :math:`y_k = s\,y_{k-1} + (1 - s)\,u_k` (Brown 1956), held in between.
+
+    A command is new where it changes, and where it stays the same for as long as the shortest one so far. That needs
+    commands as they were sent: measured ones change between two steps of the simulation, too.
+    """
+
+    kind = "command_smoothing"
+    place = "actuator"
+    parameters = (Parameter("share", "", 0.05, lower=0.0, upper=0.99),)
+    equation = "y[k] = share y[k-1] + (1 - share) u[k]"
+    excite = "commands that change quickly"
+    offered = False
+    order = -1
+
+    def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
+        """Smooth."""
+        if not memory:
+            count = len(u)
+            memory.update(y=u.copy(), u=u.copy(), age=np.zeros(count, int), shortest=np.full(count, np.iinfo(int).max))
+            memory["changed"] = np.zeros(count, dtype=bool)  # before the first change nothing tells how long they last
+            return u
+        age, changes = memory["age"] + 1, u != memory["u"]
+        new = changes | (age >= memory["shortest"])
+        memory["shortest"] = np.where(
+            changes & memory["changed"], np.minimum(age, memory["shortest"]), memory["shortest"]
+        )
+        memory["y"] = np.where(new, x[:, 0] * memory["y"] + (1 - x[:, 0]) * u, memory["y"])
+        memory.update(u=u.copy(), age=np.where(new, 0, age), changed=memory["changed"] | changes)
+        return np.asarray(memory["y"])
 
 
 @register

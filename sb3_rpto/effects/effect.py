@@ -89,7 +89,7 @@ class Effect:
     excite: ClassVar[str] = "larger and faster motion"
     #: declared parameters of the same object that are the same number, e.g. ``("damping",)``
     same: ClassVar[tuple[str, ...]] = ()
-    #: whether a machine may have it: else it is looked for only where it is named, or in a simulator's exact states
+    #: whether it is looked for in a machine's data: else only where it is named, or in a simulator's exact states
     offered: ClassVar[bool] = True
     #: where in the chain of command effects it stands; smaller is nearer the controller. Of forces: smaller acts first
     order: ClassVar[int] = 0

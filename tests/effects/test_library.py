@@ -137,6 +137,7 @@ ROWS = {
         {"inverse_stall": 0.1, "inverse_speed": 0.05},
         motor_limit,
     ),
+    "command_smoothing": Row("shoulder_motor", {"share": 0.6}, {"share": 0.2}),
     "command_delay": Row("shoulder_motor", {"delay": 0.026}, {"delay": 0.01}),
     "command_deadband": Row("elbow_motor", {"width": 0.1}, {"width": 0.02}),
     "command_gain": Row("shoulder_motor", {"change": -0.15}, {"change": 0.0}),
@@ -280,6 +281,17 @@ def test_delay_equation() -> None:
     np.testing.assert_allclose(sent("command_delay", RAMP, delay=0.02), held[1:-2])
     np.testing.assert_allclose(sent("command_delay", RAMP, delay=0.025), (held[1:-2] + held[:-3]) / 2)
     assert sent("command_delay", RAMP, delay=0.2)[-1] == RAMP[0]
+
+
+def test_smoothing_equation() -> None:
+    """Each command lasts three steps; the fourth is the third once more, as at the limit of what may be sent."""
+    once = np.array([0.5, 1.0, -1.0, -1.0, 2.0, 2.0, 0.3])
+    expected = [once[0]]
+    for u in once[1:]:
+        expected.append(0.6 * expected[-1] + 0.4 * u)
+    got = sent("command_smoothing", np.repeat(once, 3), share=0.6)
+    np.testing.assert_allclose(got, np.repeat(expected, 3), rtol=1e-12)
+    assert np.array_equal(sent("command_smoothing", np.repeat(once, 3)), np.repeat(once, 3))
 
 
 def test_delay_is_mujocos_own_from_a_step_on() -> None:
@@ -478,7 +490,7 @@ def test_geom_friction_is_the_contacts() -> None:
         np.testing.assert_array_equal(row, expected)
 
 
-DIMENSIONLESS = {"mu", "mu_driving", "mu_driven", "change", "along"}
+DIMENSIONLESS = {"share", "mu", "mu_driving", "mu_driven", "change", "along"}
 
 
 @pytest.mark.parametrize("kind", ROWS)

@@ -50,6 +50,30 @@ class Queue(gym.Wrapper):
         return self.env.step(self.queue.pop(0))
 
 
+class Smooth(gym.Wrapper):
+    """Sends a running mean of the actions, from rest on."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.mean = np.zeros_like(self.action_space.sample())
+        return self.env.reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        self.mean = 0.4 * self.mean + 0.6 * action
+        return self.env.step(self.mean)
+
+
+def test_a_filter_of_the_actions_is_found_as_it_was_written() -> None:
+    source, target = gym.make("InvertedDoublePendulum-v5"), Smooth(gym.make("InvertedDoublePendulum-v5"))
+    agent = SAC("MlpPolicy", Monitor(target), buffer_size=150, learning_starts=150, seed=0, device="cpu").learn(150)
+    assert agent.replay_buffer is not None
+    data = Measurements.from_replay(agent.replay_buffer, source)
+    kinds = ["command_smoothing", "actuator_lag", "command_delay", "command_gain"]
+    report = trace(source, data, ["pole.length"], candidates=kinds, threads=1)
+    assert report.verdict == "explained"
+    assert [(t.label, t.effect.idle) for t in report.effects] == [("command_smoothing(slide)", True)]
+    assert report.effects[0].effect.values == pytest.approx([0.4], abs=1e-3)
+
+
 @pytest.mark.parametrize("lacks", ["a queue", "a late command", "nothing"])
 def test_what_came_before_a_run_is_told_by_its_first_steps(lacks: str) -> None:
     source, name = gym.make("InvertedDoublePendulum-v5"), "slide"
