@@ -67,16 +67,18 @@ class World(ABC):
     def derive(self) -> None:
         """Derive the constants that follow from the fields (mj_setConst) in every simulation."""
 
-    def rough(self, dof: int) -> None:
+    def rough(self, dof: int, where: np.ndarray | slice = slice(None)) -> None:
         """Make a joint ready for dry friction that holds: the stiffest constraint that the time step allows.
 
         MuJoCo's default lets a loaded joint creep at up to about a tenth of a radian a second. A joint whose model has
         dry friction already keeps the model's own constraint, so that a little more changes only a little.
+
+        :param where: in which simulations, (n,)
         """
         self.field("dof_frictionloss")
         if self.model.dof_frictionloss[dof] == 0:
-            self.field("dof_solref")[:, dof] = (2 * self.model.opt.timestep, 1.0)
-            self.field("dof_solimp")[:, dof] = (0.99, 0.99, 0.001, 0.5, 2.0)
+            self.field("dof_solref")[where, dof] = (2 * self.model.opt.timestep, 1.0)
+            self.field("dof_solimp")[where, dof] = (0.99, 0.99, 0.001, 0.5, 2.0)
 
     def commit(self) -> None:
         """Write the collected ``force`` and ``friction`` to the physics."""
@@ -86,7 +88,7 @@ class World(ABC):
             if self._base_friction is None:
                 self._base_friction = self.field("dof_frictionloss").copy()
             for dof in np.flatnonzero(dry & ~self._dry):
-                self.rough(int(dof))
+                self.rough(int(dof), self._base_friction[:, dof] == 0)  # some have what gives way, and keep it
             self._dry |= dry
         if self._dry.any() and self._base_friction is not None:
             np.maximum(self._base_friction + self.friction, 0.0, out=self._live("dof_frictionloss"))

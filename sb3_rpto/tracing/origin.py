@@ -29,6 +29,8 @@ NOISELESS = 0.03
 
 #: Nothing was commanded before the runs where less than this share of their first commands arrives in the first step.
 ARRIVES = 0.75
+#: By so many standard deviations of that share.
+CLEAR = 3.0
 
 Origin: TypeAlias = Literal["machine", "simulated", "exact"]
 
@@ -72,8 +74,9 @@ def idle(simulation: Simulation, data: Measurements, sigma: np.ndarray) -> bool:
 
     none = reached(0.0)
     gained, seen = reached(1.0) - none, windows.measured[:, 0] / windows.sigma - none
-    arrives = (gained * seen).sum(axis=1) / np.maximum((gained**2).sum(axis=1), 1e-12)
-    return bool(np.median(arrives) < ARRIVES)
+    known = np.maximum((gained**2).sum(axis=1), 1e-12)
+    arrives = float(np.median((gained * seen).sum(axis=1) / known))
+    return arrives + CLEAR / float(np.sqrt(known.sum())) < ARRIVES
 
 
 def origin(

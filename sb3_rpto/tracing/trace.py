@@ -127,7 +127,9 @@ def trace(
     rounding = data.exact and found.after.adequate  # is all that is left
     floor = noise_floor(simulation, final, data, sigma, seed)
     kept = _kept(selection, simulation, final, intervals, selector.limit(selection.model), seed)
-    late = [t.effect for t in kept if fitted.idle and t.effect.overrides("command") and t.effect.remembers]
+    numbers = _declared(simulation, final, intervals)
+    there = [t.effect for t in (*numbers, *kept)]
+    late = [e for e in there if fitted.idle and e.overrides("command") and e.remembers]
     for effect in late:
         effect.idle = True
     if searched.verdict in SETTLED and found.screening is not None:
@@ -149,7 +151,7 @@ def trace(
     ]
     return Report(
         verdict=searched.verdict,
-        declared=_declared(simulation, final, intervals),
+        declared=numbers,
         effects=kept,
         candidates=_fates(selector, found.screening, selection),
         adequacy_before=first.before,

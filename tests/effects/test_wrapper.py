@@ -629,3 +629,20 @@ def test_what_is_idle_stays_so_with_other_values_and_as_json():
     late.idle = True
     for made in (late.with_values(np.array([0.1])), late.as_known(), from_json(late.to_json()), copy.deepcopy(late)):
         assert made.idle
+
+
+@pytest.mark.parametrize("level", [0.0, 0.4])
+def test_friction_that_gives_way_does_so_beside_friction_that_acts_in_the_environment_as_in_the_batch(level):
+    """A gear's friction holds where it is alone, and beside MuJoCo's own acts in its constraint."""
+    effects = [LIBRARY["soft_friction"]("slider", level=level), LIBRARY["load_friction"]("slider", mu=0.2)]
+    env = CorrectedEnv(gym.make(POLE), effects)
+    env.reset(seed=0)
+    base = env.unwrapped
+    start, command = (base.data.qpos.copy(), base.data.qvel.copy()), np.full((1, 4 * base.frame_skip, 1), 0.01)
+    for _ in range(4):
+        env.step(np.array([0.01]))
+    sim = Simulation(gym.make(POLE).unwrapped.model, effects, 1)
+    values = np.stack([sim.values(), sim.null, [0.0, 0.3], [0.2, 0.0]])
+    qpos, qvel = sim.rollout(values, *(np.tile(x, (4, 1)) for x in start), Drive(np.tile(command, (4, 1, 1))))
+    np.testing.assert_allclose(qpos[0, -1], base.data.qpos, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(qvel[0, -1], base.data.qvel, rtol=0, atol=1e-12)
