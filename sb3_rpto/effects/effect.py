@@ -222,7 +222,7 @@ class Effect:
         """The inverse of :meth:`observe`."""
         return q, v
 
-    def begin(self, x: np.ndarray, dt: float) -> dict[str, Any]:
+    def memory_at_reset(self, x: np.ndarray, dt: float) -> dict[str, Any]:
         """The memory of :meth:`command` at the beginning of an episode, for parameters (n, p)."""
         memory: dict[str, Any] = {}
         if self.idle:

@@ -147,7 +147,8 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; commands from before it are forgotten."""
         step = float(self._world.model.opt.timestep)
-        self._memory, self._past = [effect.begin(x, step) for effect, x in self._commanding], []
+        self._memory = [effect.memory_at_reset(x, step) for effect, x in self._commanding]
+        self._past = []
         return self.env.reset(seed=seed, options=options)
 
     def forget_commands(self) -> None:

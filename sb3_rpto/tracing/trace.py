@@ -127,8 +127,8 @@ def trace(
     rounding = data.exact and found.after.adequate  # is all that is left
     floor = noise_floor(simulation, final, data, sigma, seed)
     kept = _kept(selection, simulation, final, intervals, selector.limit(selection.model), seed)
-    numbers = _declared(simulation, final, intervals)
-    there = [t.effect for t in (*numbers, *kept)]
+    given = _declared(simulation, final, intervals)
+    there = [t.effect for t in (*given, *kept)]
     late = [e for e in there if fitted.idle and e.overrides("command") and e.remembers]
     for effect in late:
         effect.idle = True
@@ -151,7 +151,7 @@ def trace(
     ]
     return Report(
         verdict=searched.verdict,
-        declared=numbers,
+        declared=given,
         effects=kept,
         candidates=_fates(selector, found.screening, selection),
         adequacy_before=first.before,

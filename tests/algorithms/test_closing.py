@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from queued import Queue
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
@@ -100,18 +101,6 @@ def test_a_target_with_frictionloss_alone_is_explained(soon: None) -> None:
     assert [traced.effect.label for traced in report.effects] == ["soft_friction(slider)"]
     assert dynamics(made).describe()["soft_friction(slider).level"] == pytest.approx(LEVEL, rel=1e-3)
     assert dynamics(made).error(made.transitions("target")) < 1e-3, "the simulator gives way as the target does"
-
-
-class Queue(gym.Wrapper):
-    """Sends each action one step late, and zeros first: what such wrappers do."""
-
-    def reset(self, **kwargs: Any) -> Any:
-        self.queue = [np.zeros(1)]
-        return self.env.reset(**kwargs)
-
-    def step(self, action: Any) -> Any:
-        self.queue.append(action)
-        return self.env.step(self.queue.pop(0))
 
 
 def test_a_target_that_queues_actions_is_met_from_the_first_step_of_an_episode_on(soon: None, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.utils.env_checker import check_env
+from queued import Queue
 from stable_baselines3 import SAC
 
 from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales, Simulation
@@ -591,18 +592,6 @@ def test_the_models_own_sensors_err_as_well(tmp_path):
         np.testing.assert_allclose(seen, np.array([0.3, 0.0]) + expected, atol=1e-12)
     np.testing.assert_array_equal(biased.unwrapped.data.qpos, true.data.qpos)
     np.testing.assert_array_equal(biased.unwrapped.data.sensordata, true.data.sensordata)
-
-
-class Queue(gym.Wrapper):
-    """Sends each action one step late, and zeros first: what such wrappers do."""
-
-    def reset(self, **kwargs):
-        self.queue = [np.zeros(self.action_space.shape)]
-        return self.env.reset(**kwargs)
-
-    def step(self, action):
-        self.queue.append(action)
-        return self.env.step(self.queue.pop(0))
 
 
 def test_an_idle_delay_is_a_queue_of_actions_that_is_empty_at_a_reset():

@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from queued import Queue
 from simulated import compiled, recorded
 from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
@@ -36,18 +37,6 @@ def test_friction_that_gives_way_is_not_looked_for_where_no_dry_one_is(monkeypat
     report = trace(OWN, data, ["pole.mass"], candidates=["torque_offset"], simulated=True, threads=1)
     assert report.verdict == "unexplained"
     assert [c.label for c in report.candidates] == ["torque_offset(hinge)"]
-
-
-class Queue(gym.Wrapper):
-    """Sends each action one step late, and zeros first."""
-
-    def reset(self, **kwargs: Any) -> Any:
-        self.queue = [np.zeros_like(self.action_space.sample())]
-        return self.env.reset(**kwargs)
-
-    def step(self, action: Any) -> Any:
-        self.queue.append(action)
-        return self.env.step(self.queue.pop(0))
 
 
 class Smooth(gym.Wrapper):
