@@ -161,6 +161,9 @@ EFFECTS = (
 
 def bounds(p: Parameter) -> str:
     """What values a parameter may have."""
+    if p.own:
+        assert (p.lower, p.upper) == (0, np.inf)
+        return f"-`{p.own}` or more"
     if np.isinf(p.upper):
         return "any" if np.isinf(p.lower) else f"{p.lower:g} or more"
     low, high = (f"{'-' * (end < 0)}pi" if abs(end) == np.pi else f"{end:g}" for end in (p.lower, p.upper))

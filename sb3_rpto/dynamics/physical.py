@@ -126,7 +126,6 @@ class PhysicalDynamics(Dynamics):
         scales = Scales(torque=strongest if strongest > 0 else 1.0)
         parameters = [p for e in self.simulation.effects for p in e.parameters]
         self.names = [_name(e, p.name) for e in self.simulation.effects for p in e.parameters]
-        self._lower, self._upper = (np.array([getattr(p, b) for p in parameters]) for b in ("lower", "upper"))
         values = self.simulation.values()
         sizes = np.array([p.size_for(scales) for p in parameters])
         #: what is much of each parameter: its nominal value or what is plausible, (p,)
@@ -162,7 +161,7 @@ class PhysicalDynamics(Dynamics):
         if generator is not None and self.randomise > 0:
             known = np.where(np.isfinite(self.deviation), self.deviation, 0.0)  # nothing tells how far else to go
             values = values + self.randomise * known * generator.standard_normal(len(values))
-            values = np.clip(values, self._lower, self._upper)
+            values = np.clip(values, self.simulation.lower, self.simulation.upper)
         return [e.with_values(values[s]) for e, s in zip(self.simulation.effects, self.simulation.slices)]
 
     def deviations(self) -> dict[str, np.ndarray]:
@@ -206,7 +205,7 @@ class PhysicalDynamics(Dynamics):
             [isinstance(e, Declared) for e in self.simulation.effects for _ in e.parameters], dtype=bool
         )
         values = self.values
-        there = (values <= self._lower) | (values >= self._upper)
+        there = (values <= self.simulation.lower) | (values >= self.simulation.upper)
         moved = declared & there & (values != self.simulation.null)
         return [f"{self.names[i]} = {values[i]:.4g}" for i in np.flatnonzero(moved)]
 
@@ -316,7 +315,7 @@ class PhysicalDynamics(Dynamics):
         if not steps.compared.any() or not len(self.names):
             return {"steps": 0.0, "left_out": left_out}
         values, taken = self.values.copy(), 0
-        problem = OneStep(self.simulation, self.scale, self._lower, self._upper, steps, weights)
+        problem = OneStep(self.simulation, self.scale, self.simulation.lower, self.simulation.upper, steps, weights)
         problem.hold_what_is_not_determined(values)
         for _ in range(self.max_steps if max_steps is None else max_steps):
             moved = problem.step(values, self.max_step)

@@ -7,7 +7,26 @@ from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.inertia import from_tensor, rotations, spread, to_tensor
 from sb3_rpto.effects.length import held_by_constraint, link_length, write_length
 from sb3_rpto.effects.names import object_names
-from sb3_rpto.effects.world import World
+from sb3_rpto.effects.world import World, add
+
+
+@register
+class MassScale(Effect):
+    r"""A body of another density: MuJoCo's ``body_mass`` and ``body_inertia`` are :math:`1 + c` times as much."""
+
+    kind = "mass_scale"
+    place = "body"
+    parameters = (Parameter("change", "", 0.03, lower=-0.9, upper=9.0),)
+    equation = "(1 + change) mass and inertia"
+    native = "inertial"
+    excite = "accelerations, and poses at which gravity pulls"
+    same = ("mass",)
+    offered = False
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Scale the body's mass and inertia."""
+        world.field("body_mass")[:, self.index] *= 1 + x[:, 0]
+        world.field("body_inertia")[:, self.index] *= 1 + x
 
 
 @register
@@ -56,7 +75,7 @@ class Armature(Effect):
 
     kind = "armature"
     place = "joint"
-    parameters = (Parameter("inertia", "kg·m²", lambda s: 0.05 * s.inertia, lower=0.0),)
+    parameters = (Parameter("inertia", "kg·m²", lambda s: 0.05 * s.inertia, lower=0.0, own="dof_armature"),)
     equation = "-inertia qdd"
     native = "armature"
     excite = "large accelerations"
@@ -64,7 +83,7 @@ class Armature(Effect):
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Add to armature."""
-        world.field("dof_armature")[:, self.dof] += x[:, 0]
+        add(world.field("dof_armature")[:, self.dof], x[:, 0])
 
 
 @register
@@ -200,8 +219,8 @@ class Fluid(Effect):
     kind = "fluid"
     place = "world"
     parameters = (
-        Parameter("density", "kg/m³", 10.0, lower=0.0),
-        Parameter("viscosity", "Pa·s", 0.1, lower=0.0),
+        Parameter("density", "kg/m³", 10.0, lower=0.0, own="opt.density"),
+        Parameter("viscosity", "Pa·s", 0.1, lower=0.0, own="opt.viscosity"),
     )
     equation = "drag = density f(v |v|, size) + viscosity f(v, size)"
     native = "option density"
@@ -211,7 +230,7 @@ class Fluid(Effect):
     def write(self, world: World, x: np.ndarray) -> None:
         """Add to density and viscosity."""
         for column, name in enumerate(("opt.density", "opt.viscosity")):
-            world.field(name)[:] += x[:, column].reshape(world.field(name).shape)
+            add(world.field(name), x[:, column].reshape(world.field(name).shape))
 
 
 @register

@@ -48,6 +48,8 @@ class Parameter:
     :param upper: largest value
     :param null: value at which the effect does nothing; for a shape parameter (any value does) where a fit starts
     :param shape: True when the parameter means nothing while the others are at their null values
+    :param own: field of the model that it adds to, e.g. ``"dof_damping"`` or ``"opt.density"``: values may go below
+        ``lower`` by what the model has there, for a target that has less of it
     :param starts: where a fit may start as well, in sizes from the null: there a shape may hide what the others do, and
         a limit that nothing reaches does nothing
     """
@@ -59,6 +61,7 @@ class Parameter:
     upper: float = np.inf
     null: float = 0.0
     shape: bool = False
+    own: str = ""
     starts: tuple[float, ...] = ()
 
     def size_for(self, scales: Scales) -> float:
@@ -109,7 +112,7 @@ class Effect:
         self.on = on
         self.values = np.array([float(values.get(p.name, p.null)) for p in self.parameters])
         for p, value in zip(self.parameters, self.values):
-            if not p.lower <= value <= p.upper:
+            if not (-np.inf if p.own else p.lower) <= value <= p.upper:
                 raise ValueError(f"{self.kind}: {p.name}={value:g} {p.unit} is outside [{p.lower:g}, {p.upper:g}]")
 
     @property
@@ -123,7 +126,7 @@ class Effect:
 
     def with_values(self, values: np.ndarray) -> Effect:
         """The same effect with other parameters, (p,), clipped to their bounds."""
-        low, high = ([getattr(p, bound) for p in self.parameters] for bound in ("lower", "upper"))
+        low, high = zip(*((-np.inf if p.own else p.lower, p.upper) for p in self.parameters))
         clipped = np.clip(values, low, high)
         made = type(self)(self.on, **{p.name: float(v) for p, v in zip(self.parameters, clipped)})
         made.idle = self.idle
@@ -178,7 +181,8 @@ class Effect:
     def bind(self, model: mujoco.MjModel) -> None:
         """Look up the ids of the place: ``self.dof`` and ``self.adr`` of a joint, ``self.index`` of anything.
 
-        :raises ValueError: the model has no such object, or the effect cannot sit on it, see :meth:`places`
+        :raises ValueError: the model has no such object, the effect cannot sit on it, see :meth:`places`, or it takes
+            away more than the model has
         """
         if self.place in ("joint", "sensor"):
             joint = object_id(model, "joint", self.on)
@@ -190,6 +194,21 @@ class Effect:
         # Which geoms touch, and whether there is a fluid or gravity, follows from numbers that other effects change.
         if self.place not in ("geom", "world") and self.on not in self.places(model):
             raise ValueError(f"{self.kind} cannot sit on {self.place} {self.on!r}: {self.why_not(model)}")
+        for p, value, lowest in zip(self.parameters, self.values, self.lowest(model)):
+            if value < lowest - 1e-9 * abs(lowest):
+                raise ValueError(
+                    f"{self.label}: {p.name}={value:g} {p.unit} takes away more than the model has; "
+                    f"give {lowest:g} or more"
+                )
+
+    def lowest(self, model: mujoco.MjModel) -> np.ndarray:
+        """Smallest values of the parameters in a model that it is bound to, (p,): see ``own`` of :class:`Parameter`."""
+        return np.array([p.lower - (self._has(model, p.own) if p.own else 0.0) for p in self.parameters])
+
+    def _has(self, model: mujoco.MjModel, field: str) -> float:
+        if field.startswith("opt."):
+            return float(getattr(model.opt, field.removeprefix("opt.")))
+        return float(getattr(model, field)[self.dof if field.startswith("dof_") else self.index])
 
     @property
     def ctrl(self) -> int:

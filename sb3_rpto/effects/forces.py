@@ -6,7 +6,7 @@ import numpy as np
 from sb3_rpto.effects.actuation import joint_loss, memoryless, motor_torque, motors
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.names import SCALAR_JOINTS, hinges, object_names
-from sb3_rpto.effects.world import World
+from sb3_rpto.effects.world import World, add
 
 
 @register
@@ -63,7 +63,7 @@ class Spring(Effect):
     kind = "spring"
     place = "joint"
     parameters = (
-        Parameter("stiffness", "N·m/rad", lambda s: 0.03 * s.torque / s.span, lower=0.0),
+        Parameter("stiffness", "N·m/rad", lambda s: 0.03 * s.torque / s.span, lower=0.0, own="jnt_stiffness"),
         Parameter("reference", "rad", lambda s: 0.3 * s.span, shape=True),
     )
     equation = "-stiffness (q - reference)"
@@ -81,11 +81,11 @@ class Spring(Effect):
         """Add to the joint's own spring."""
         stiffness = world.field("jnt_stiffness")[:, self.index]
         reference = world.field("qpos_spring")[:, self.adr]
-        total = stiffness + x[:, 0]
+        total = np.maximum(stiffness + x[:, 0], 0.0)
         # With no stiffness at all the reference means nothing and stays.
         share = np.divide(x[:, 0], total, out=np.zeros_like(total), where=total > 0)
         reference += share * (x[:, 1] - reference)
-        stiffness += x[:, 0]
+        add(stiffness, x[:, 0])
 
 
 @register

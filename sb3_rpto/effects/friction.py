@@ -6,7 +6,7 @@ import numpy as np
 from sb3_rpto.effects.actuation import driven, joint_torque, motors
 from sb3_rpto.effects.effect import Effect, Parameter, Scales, register
 from sb3_rpto.effects.names import hinges, object_names
-from sb3_rpto.effects.world import World
+from sb3_rpto.effects.world import World, add
 
 
 def _torque(scales: Scales) -> float:
@@ -22,7 +22,7 @@ class CoulombFriction(Effect):
 
     kind = "coulomb_friction"
     place = "joint"
-    parameters = (Parameter("level", "N·m", _torque, lower=0.0),)
+    parameters = (Parameter("level", "N·m", _torque, lower=0.0, own="dof_frictionloss"),)
     equation = "-level sign(qd)"
     native = "frictionloss"
     excite = "motion that often reverses, at small and at large speed"
@@ -31,7 +31,7 @@ class CoulombFriction(Effect):
     def write(self, world: World, x: np.ndarray) -> None:
         """Add to frictionloss."""
         world.rough(self.dof)
-        world.field("dof_frictionloss")[:, self.dof] += x[:, 0]
+        add(world.field("dof_frictionloss")[:, self.dof], x[:, 0])
 
 
 @register
@@ -49,7 +49,7 @@ class SoftFriction(CoulombFriction):
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Add to frictionloss, and leave its constraint as it is."""
-        world.field("dof_frictionloss")[:, self.dof] += x[:, 0]
+        add(world.field("dof_frictionloss")[:, self.dof], x[:, 0])
 
 
 @register
@@ -81,7 +81,9 @@ class ViscousFriction(Effect):
 
     kind = "viscous_friction"
     place = "joint"
-    parameters = (Parameter("coefficient", "N·m·s/rad", lambda s: _torque(s) / s.velocity, lower=0.0),)
+    parameters = (
+        Parameter("coefficient", "N·m·s/rad", lambda s: _torque(s) / s.velocity, lower=0.0, own="dof_damping"),
+    )
     equation = "-coefficient qd"
     native = "damping"
     excite = "motion at several speeds"
@@ -89,7 +91,7 @@ class ViscousFriction(Effect):
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Add to damping."""
-        world.field("dof_damping")[:, self.dof] += x[:, 0]
+        add(world.field("dof_damping")[:, self.dof], x[:, 0])
 
 
 @register

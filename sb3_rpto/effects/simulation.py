@@ -63,6 +63,9 @@ class Simulation:
         self.slices = [slice(end - len(e.parameters), end) for e, end in zip(self.effects, ends)]
         self.size = ends[-1] if ends else 0
         self.null = np.array([p.null for e in self.effects for p in e.parameters])
+        #: bounds of the parameters in this model, (p,)
+        self.lower = np.concatenate([e.lowest(self.model) for e in self.effects] or [np.empty(0)])
+        self.upper = np.array([p.upper for e in self.effects for p in e.parameters])
         #: (p,) False for parameters of shape, which do nothing by themselves
         self.strength = np.array([not p.shape for e in self.effects for p in e.parameters], dtype=bool)
         self._settings: dict[str, Declared] = {}

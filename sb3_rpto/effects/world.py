@@ -10,6 +10,11 @@ from mujoco.batch import Batch
 _DERIVING = frozenset(mujoco.MjModel._setconst_inputs)
 
 
+def add(numbers: np.ndarray, amounts: np.ndarray) -> None:
+    """Add, in place, to numbers of a model that are never negative; negative amounts take away, at most all."""
+    numbers[:] = np.maximum(numbers + amounts, 0.0)
+
+
 class World(ABC):
     """``n`` simulations of one model, as arrays whose first axis is the simulation.
 

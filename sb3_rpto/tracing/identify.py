@@ -81,7 +81,7 @@ class Problem:
         self.simulation, self.windows, self.scales = simulation, windows, scales
         parameters = [(p, s) for e, s in zip(simulation.effects, scales) for p in e.parameters]
         self.size = np.array([p.size_for(s) for p, s in parameters])
-        self.lower = np.array([p.lower for p, _ in parameters])
+        self.lower = simulation.lower
         self.upper = np.array(
             [
                 e.ceiling(s) if isinstance(e, Declared) else p.upper

@@ -12,6 +12,7 @@ from sb3_rpto.tracing.calibrate import calibrated
 from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evidence import GAIN
 from sb3_rpto.tracing.identify import Fit, Problem
+from sb3_rpto.tracing.kinds import few_kinds
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.screen import Screening, screen
 from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
@@ -224,7 +225,7 @@ def search(on: Selectors, base: Model, screening: Screening, seed: int = 0) -> S
     if rough.train.exact or (rough.train.touching and rough.far(alone)):
         on.say(0.2, "looking for a single kind")
         excited = [i for i, e in enumerate(rough.simulation.effects) if not e.known and screening.excited(i)]
-        one = rough.one_kind(excited, alone.fit)
+        one = few_kinds(rough, excited, alone.fit)
         if one is not None:
             selection = settle(on, Selection(one), screening)
             enough = rough.train.exact or judged(on.fine, selection.model, seed).adequate

@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.tracing import concentrate
-from sb3_rpto.tracing.concentrate import concentrated, led_on
+from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds, several_missed
 from sb3_rpto.tracing.identify import Fit, Linear, Problem
 from sb3_rpto.tracing.loss import FAR
@@ -39,8 +39,6 @@ SEEMS = 1.5
 #: Rounds of the look forward, after a joint fit and in its place; candidates of each that are fitted to some windows
 #: and to all.
 ROUNDS, INSTEAD, QUICK, PROMISING = 3, 8, 10, 4
-#: Kinds, the nearest at all their places, that are led on alone.
-KINDS = 3
 #: Typical window error, in units of the noise, that leaves nothing to look forward to.
 ENOUGH = 1.1
 
@@ -159,26 +157,7 @@ class Selector:
             best = min(best, other, key=lambda fit: fit.cost)
         return self.model(effects, best), few
 
-    def one_kind(self, effects: Sequence[int], base: Fit) -> Model | None:
-        """The kind that alone accounts for the data, at all its places, if there is one: the simplest of the nearest.
-
-        :param effects: indices of the candidates
-        :param base: the declared parameters alone
-        """
-        fits = {}
-        for (kind, driven), places in self._by_kind(effects, apart=True).items():
-            self.say(0.0, f"{kind} at all places")
-            fits[kind, driven] = places, self.train.fit(base.values, self.free(places), base.starts, JOINT)
-        nearest = sorted(fits.values(), key=lambda found: found[1].cost)[:KINDS]
-        for places, fit in sorted(nearest, key=lambda found: len(self.free(found[0]))):
-            begin = concentrated(self.train, fit, self.free(places))
-            if np.median(begin.errors) < max(FAR, TENTH * np.median(base.errors)):  # else kinks are not all it lacks
-                model = self.led_on(self.model(places, begin))
-                if self.met(model) if self.train.exact else not self.far(model):
-                    return model
-        return None
-
-    def _by_kind(self, effects: Sequence[int], apart: bool = False) -> dict[tuple[str, bool], list[int]]:
+    def by_kind(self, effects: Sequence[int], apart: bool = False) -> dict[tuple[str, bool], list[int]]:
         """Effects by their kind, those on driven joints ``apart`` or not: the drives of a machine are built alike."""
         model = self.simulation.model
         driven = set(model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0].tolist())
@@ -197,7 +176,7 @@ class Selector:
         some = np.arange(0, len(self.train.windows), 3)
         part, chosen = self.train.on(some), list[int]()
         fit = part.fit(base.values, self.free(()), base.starts[some], REFIT)
-        kinds = self._by_kind(effects)
+        kinds = self.by_kind(effects)
         for _ in range(min(ROUNDS, len(kinds))):
             self.say(0.0, f"another start, with {len(chosen)} of the candidates")
             fits = {k: part.fit(fit.values, self.free([*chosen, *g]), fit.starts, REFIT) for k, g in kinds.items()}

@@ -147,6 +147,7 @@ ROWS = {
     "sensor_delay": Row("elbow", {"delay": 0.026}, {"delay": 0.01}),
     "sensor_bias": Row("elbow", {"offset": 0.05}, {"offset": 0.0}),
     "sensor_gain": Row("shoulder", {"change": 0.04}, {"change": 0.0}),
+    "mass_scale": Row("lower", {"change": -0.25}, {"change": 0.0}),
     "payload": Row("lower", {"mass": 0.3, "along": 1.6}, {"mass": 0.1, "along": 1.0}),
     "armature": Row("elbow", {"inertia": 0.02}, {"inertia": 0.005}),
     "link_length": Row("lower", {"change": 0.12}, {"change": 0.0}),
@@ -525,13 +526,83 @@ def test_json_round_trip(kind: str) -> None:
     assert again.label == effect.label
     np.testing.assert_array_equal(again.values, effect.values)
     assert effect.with_values(np.full(len(effect.values), -1e9)).values.tolist() == [
-        p.lower if np.isfinite(p.lower) else -1e9 for p in effect.parameters
+        p.lower if np.isfinite(p.lower) and not p.own else -1e9 for p in effect.parameters
     ]
 
 
+#: A joint that has some of everything.
+HAVING = mujoco.MjModel.from_xml_string("""<mujoco><compiler angle="radian"/>
+<option timestep="0.002" density="40" viscosity="0.4"/><worldbody><body><joint name="hinge" axis="0 1 0"
+damping="0.2" frictionloss="0.3" armature="0.05" stiffness="1.5" springref="0.4"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.5" size=".05" mass="1"/></body></worldbody></mujoco>""")
+OWN = {
+    "coulomb_friction": ("level", "dof_frictionloss", 0.3),
+    "soft_friction": ("level", "dof_frictionloss", 0.3),
+    "viscous_friction": ("coefficient", "dof_damping", 0.2),
+    "armature": ("inertia", "dof_armature", 0.05),
+    "spring": ("stiffness", "jnt_stiffness", 1.5),
+    "fluid": ("density", "opt.density", 40.0),
+}
+
+
+def test_effects_that_take_away_are_those_of_numbers_of_the_model() -> None:
+    taking = {name for name, kind in LIBRARY.items() if shipped(kind) and any(p.own for p in kind.parameters)}
+    assert taking == set(OWN)
+
+
+@pytest.mark.parametrize("kind", OWN)
+@pytest.mark.parametrize("share", [0.6, 1.0])
+def test_an_effect_takes_away_what_the_model_has_bit_for_bit(kind: str, share: float) -> None:
+    name, field, own = OWN[kind]
+    more = {"reference": 0.4} if kind == "spring" else {}
+    on = "" if kind == "fluid" else "hinge"
+    effect = LIBRARY[kind](on, **{name: -share * own}, **more)
+
+    def less(m: mujoco.MjModel) -> None:
+        if field.startswith("opt."):
+            m.opt.density = own + -share * own
+        else:
+            getattr(m, field)[0] = own + -share * own
+
+    start = np.array([[0.7], [0.0]]), np.array([[-3.0], [2.0]]), Drive(np.zeros((2, 50, 0)))
+    got = Simulation(HAVING, [effect], 1)
+    expected = Simulation(edited(HAVING, less), [], 1).rollout(np.empty((2, 0)), *start)[0]
+    np.testing.assert_allclose(got.rollout(np.tile(effect.values, (2, 1)), *start)[0], expected, rtol=1e-12)
+    index = [p.name for p in effect.parameters].index(name)
+    assert got.lower[index] == -own
+
+
+@pytest.mark.parametrize("kind", OWN)
+def test_no_effect_takes_away_more_than_there_is(kind: str) -> None:
+    name, _, own = OWN[kind]
+    on = "" if kind == "fluid" else "hinge"
+    effect = LIBRARY[kind](on, **{name: -1.1 * own})
+    assert effect.values.tolist() == from_json(effect.to_json()).values.tolist()
+    message = rf"{name}=-{1.1 * own:g} .* takes away more than the model has; give -{own:g} or more"
+    with pytest.raises(ValueError, match=message):
+        Simulation(HAVING, [effect], 1)
+    none = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="hinge"/><geom size="0.1"/></body>
+    </worldbody></mujoco>""")
+    with pytest.raises(ValueError, match="takes away more than the model has; give 0 or more"):
+        LIBRARY[kind](on, **{name: -0.01}).bind(none)
+    assert Simulation(none, [LIBRARY[kind](on)], 1).lower[0] == 0
+
+
+def test_a_lighter_body_is_one_of_another_density() -> None:
+    def lighter(m: mujoco.MjModel) -> None:
+        m.body_mass[2] *= 0.7
+        m.body_inertia[2] *= 0.7
+
+    name = ARM.body(2).name
+    got = one_step(ARM, [LIBRARY["mass_scale"](name, change=-0.3)])
+    np.testing.assert_allclose(got, one_step(edited(ARM, lighter), []), rtol=1e-12)
+
+
 def test_bounds_and_names_are_checked() -> None:
-    with pytest.raises(ValueError, match=r"level=-1 N·m is outside \[0, inf\]"):
-        LIBRARY["coulomb_friction"]("hinge", level=-1.0)
+    with pytest.raises(ValueError, match=r"mu=-0.1  is outside \[0, 1\]"):
+        LIBRARY["load_friction"]("hinge", mu=-0.1)
+    with pytest.raises(ValueError, match=r"mu_driven=2  is outside"):
+        LIBRARY["directional_load_friction"]("hinge", mu_driven=2.0)
     with pytest.raises(ValueError, match="has no parameter 'leve'; did you mean 'level'"):
         LIBRARY["coulomb_friction"]("hinge", leve=1.0)
     tendon = mujoco.MjModel.from_xml_string("""

@@ -10,7 +10,7 @@ from simulated import compiled, recorded
 from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_rpto.effects import LIBRARY
+from sb3_rpto.effects import LIBRARY, Effect
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.tracing import Measurements, conclude, trace
 
@@ -92,11 +92,48 @@ def test_what_came_before_a_run_is_told_by_its_first_steps(lacks: str) -> None:
             np.testing.assert_allclose(*seen, rtol=0, atol=1e-5)
 
 
-def test_another_gravity_is_found_in_the_states_of_a_simulator_where_nothing_is_declared() -> None:
-    source, target = gym.make("rpto/InvertedDoublePendulum-v0"), gym.make("rpto/InvertedDoublePendulum-gravity-x0.5-v0")
+def transitions(source: gym.Env, target: gym.Env) -> Measurements:
     agent = SAC("MlpPolicy", Monitor(target), buffer_size=150, learning_starts=150, seed=0, device="cpu").learn(150)
     assert agent.replay_buffer is not None
-    report = trace(source, Measurements.from_replay(agent.replay_buffer, source), threads=1)
+    return Measurements.from_replay(agent.replay_buffer, source)
+
+
+def test_another_gravity_is_found_in_the_states_of_a_simulator_where_nothing_is_declared() -> None:
+    source, target = gym.make("rpto/InvertedDoublePendulum-v0"), gym.make("rpto/InvertedDoublePendulum-gravity-x0.5-v0")
+    report = trace(source, transitions(source, target), threads=1)
     assert report.verdict == "explained"
     assert [traced.label for traced in report.effects] == ["gravity_scale"]
     assert report.effects[0].effect.values == pytest.approx([-0.5], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        [LIBRARY["mass_scale"]("pole", change=-0.3)],
+        [LIBRARY["viscous_friction"](hinge, coefficient=-0.03) for hinge in ("hinge", "hinge2")],
+        [LIBRARY["link_length"]("pole2", change=0.1), LIBRARY["viscous_friction"]("hinge", coefficient=-0.02)],
+    ],
+    ids=["a lighter body", "less damping", "two kinds"],
+)
+def test_a_simulator_that_has_less_is_explained_where_nothing_is_declared(planted: list[Effect]) -> None:
+    source = gym.make("InvertedDoublePendulum-v5")
+    target = apply_effects(gym.make("InvertedDoublePendulum-v5"), planted)
+    kinds = ["mass_scale", "payload", "link_length", "viscous_friction", "asymmetric_damping", "armature", "fluid"]
+    report = trace(source, transitions(source, target), candidates=kinds, threads=1)
+    assert report.verdict == "explained"
+    assert [traced.label for traced in report.effects] == [effect.label for effect in planted]
+    for traced, effect in zip(report.effects, planted):
+        assert traced.effect.values == pytest.approx(effect.values, abs=2e-4)
+
+
+@pytest.mark.parametrize("less", [True, False])
+def test_a_log_tells_that_the_model_has_too_much(less: bool) -> None:
+    lacks = [LIBRARY["viscous_friction"]("hinge", coefficient=-0.035)] if less else []
+    data = recorded(lacks, compiled(OWN), noise=1e-3)
+    report = trace(OWN, data, ["pole.mass"], candidates=["viscous_friction", *KINDS], simulated=True, threads=1)
+    assert report.verdict == ("explained" if less else "complete")
+    assert [traced.label for traced in report.effects] == [effect.label for effect in lacks]
+    for traced in report.effects:
+        assert traced.effect.values == pytest.approx([-0.035], rel=0.02)
+        low, high = (bound[0] for bound in traced.interval)
+        assert low < traced.effect.values[0] < high < 0

@@ -1,4 +1,4 @@
-"""One kind of effect at all its places: what meets exact data needs no others."""
+"""A few kinds of effects, each at all its places: what meets exact data needs no others."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,9 @@ from simulated import WITH_WHEEL, compiled, problem, recorded
 
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
-from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction, ViscousFriction
+from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, StribeckFriction, ViscousFriction
+from sb3_rpto.tracing import kinds
+from sb3_rpto.tracing.kinds import few_kinds
 from sb3_rpto.tracing.screen import screen
 from sb3_rpto.tracing.search import Selectors, search
 from sb3_rpto.tracing.select import THRESHOLD, Model, Selector
@@ -40,16 +42,29 @@ def base(s: Selector) -> Model:
 def test_the_simplest_kind_that_meets_exact_data_is_taken(planted: Effect, found: int) -> None:
     """Stribeck friction contains the other two, so it meets them as well."""
     s = selector([planted])
-    model = s.one_kind(range(4), base(s).fit)
+    model = few_kinds(s, range(4), base(s).fit)
     assert model is not None
     assert model.effects == (found,)
     assert s.met(model)
     assert model.fit.values[s.simulation.slices[found]] == pytest.approx(planted.values, rel=1e-4)
 
 
-def test_no_kind_alone_meets_what_two_have_done() -> None:
+def test_two_kinds_meet_what_neither_does_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     s = selector([CoulombFriction("hinge", level=0.08), TorqueOffset("hinge", offset=0.1)])
-    assert s.one_kind(range(4), base(s).fit) is None
+    model = few_kinds(s, range(4), base(s).fit)
+    assert model is not None
+    assert s.met(model)
+    assert model.effects == (COULOMB, OFFSET)
+    monkeypatch.setattr(kinds, "MOST", 1)
+    assert few_kinds(s, range(4), base(s).fit) is None
+
+
+def test_kinds_are_given_up_where_the_nearest_hardly_helps() -> None:
+    s = selector([QuadraticDrag("hinge", coefficient=0.02)])
+    looked: list[str] = []
+    s.say = lambda share, what: looked.append(what)
+    assert few_kinds(s, [OFFSET, COULOMB], base(s).fit) is None
+    assert looked == ["torque_offset at all places", "coulomb_friction at all places"]
 
 
 def test_a_kind_that_meets_exact_data_ends_the_search_before_single_effects_are_looked_for() -> None:
@@ -71,5 +86,5 @@ def test_driven_joints_are_a_kind_apart() -> None:
     model = compiled(WITH_WHEEL)
     effects = [CoulombFriction("axle"), CoulombFriction("hinge"), TorqueOffset("axle")]
     s = Selector(problem(effects, recorded(model=model), model), None, THRESHOLD, lambda share, what: None)
-    assert list(s._by_kind([0, 1, 2], apart=True).values()) == [[0], [1], [2]]
-    assert list(s._by_kind([0, 1, 2]).values()) == [[0, 1], [2]]
+    assert list(s.by_kind([0, 1, 2], apart=True).values()) == [[0], [1], [2]]
+    assert list(s.by_kind([0, 1, 2]).values()) == [[0, 1], [2]]
