@@ -224,8 +224,7 @@ def search(on: Selectors, base: Model, screening: Screening, seed: int = 0) -> S
     alone = rough.model((), base.fit)
     if rough.train.exact or (rough.train.touching and rough.far(alone)):
         on.say(0.2, "looking for a single kind")
-        excited = [i for i, e in enumerate(rough.simulation.effects) if not e.known and screening.excited(i)]
-        one = few_kinds(rough, excited, alone.fit)
+        one = few_kinds(rough, screening, alone.fit)
         if one is not None:
             selection = settle(on, Selection(one), screening)
             enough = rough.train.exact or judged(on.fine, selection.model, seed).adequate

@@ -24,14 +24,19 @@ CANDIDATES: list[Effect] = [
 STRIBECK, COULOMB, OFFSET, VISCOUS = range(4)
 
 
-def selector(planted: list[Effect], exact: bool = True) -> Selector:
+def selector(planted: list[Effect], exact: bool = True, candidates: list[Effect] = CANDIDATES) -> Selector:
     data = recorded(planted, noise=0.0 if exact else 1e-3, exact=exact)
-    train = problem(CANDIDATES, data, noise=EXACT if exact else 1e-3)
+    train = problem(candidates, data, noise=EXACT if exact else 1e-3)
     return Selector(train, None, THRESHOLD, lambda share, what: None)
 
 
 def base(s: Selector) -> Model:
     return s.model((), s.train.score(s.train.null))
+
+
+def few(s: Selector) -> Model | None:
+    begun = base(s).fit
+    return few_kinds(s, screen(s.train, begun), begun)
 
 
 @pytest.mark.parametrize(
@@ -42,7 +47,7 @@ def base(s: Selector) -> Model:
 def test_the_simplest_kind_that_meets_exact_data_is_taken(planted: Effect, found: int) -> None:
     """Stribeck friction contains the other two, so it meets them as well."""
     s = selector([planted])
-    model = few_kinds(s, range(4), base(s).fit)
+    model = few(s)
     assert model is not None
     assert model.effects == (found,)
     assert s.met(model)
@@ -51,19 +56,21 @@ def test_the_simplest_kind_that_meets_exact_data_is_taken(planted: Effect, found
 
 def test_two_kinds_meet_what_neither_does_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     s = selector([CoulombFriction("hinge", level=0.08), TorqueOffset("hinge", offset=0.1)])
-    model = few_kinds(s, range(4), base(s).fit)
+    model = few(s)
     assert model is not None
     assert s.met(model)
     assert model.effects == (COULOMB, OFFSET)
     monkeypatch.setattr(kinds, "MOST", 1)
-    assert few_kinds(s, range(4), base(s).fit) is None
+    assert few(s) is None
 
 
 def test_kinds_are_given_up_where_the_nearest_hardly_helps() -> None:
-    s = selector([QuadraticDrag("hinge", coefficient=0.02)])
+    s = selector(
+        [QuadraticDrag("hinge", coefficient=0.02)], candidates=[TorqueOffset("hinge"), CoulombFriction("hinge")]
+    )
     looked: list[str] = []
     s.say = lambda share, what: looked.append(what)
-    assert few_kinds(s, [OFFSET, COULOMB], base(s).fit) is None
+    assert few(s) is None
     assert looked == ["torque_offset at all places", "coulomb_friction at all places"]
 
 
