@@ -48,10 +48,10 @@ class Parameter:
     :param upper: largest value
     :param null: value at which the effect does nothing; for a shape parameter (any value does) where a fit starts
     :param shape: True when the parameter means nothing while the others are at their null values
-    :param own: field of the model that it adds to, e.g. ``"dof_damping"`` or ``"opt.density"``: values may go below
-        ``lower`` by what the model has there, for a target that has less of it
     :param starts: where a fit may start as well, in sizes from the null: there a shape may hide what the others do, and
         a limit that nothing reaches does nothing
+    :param own: field of the model that it adds to, e.g. ``"dof_damping"`` or ``"opt.density"``: values may go below
+        ``lower`` by what the model has there, for a target that has less of it
     """
 
     name: str
@@ -61,8 +61,8 @@ class Parameter:
     upper: float = np.inf
     null: float = 0.0
     shape: bool = False
-    own: str = ""
     starts: tuple[float, ...] = ()
+    own: str = ""
 
     def size_for(self, scales: Scales) -> float:
         """:attr:`size` where things are as large as ``scales`` says."""

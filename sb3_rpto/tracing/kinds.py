@@ -38,15 +38,16 @@ def few_kinds(selector: Selector, screening: Screening, base: Fit) -> Model | No
             selector.say(0.0, f"{kind} at all places")
             together = [*chosen, *places]
             fits.append((together, train.fit(fit.values, selector.free(together), fit.starts, JOINT)))
-        nearest = []
-        for together, begun in sorted(fits, key=lambda found: found[1].cost)[:NEAREST]:
-            nearest.append((together, concentrated(train, begun, selector.free(together))))
+        nearest = sorted(fits, key=lambda found: found[1].cost)[:NEAREST]
+        led = [(list[int](), fit)]
         for together, begun in sorted(nearest, key=lambda found: len(selector.free(found[0]))):
+            begun = concentrated(train, begun, selector.free(together))
             if np.median(begun.errors) < max(FAR, TENTH * np.median(base.errors)):  # else kinks are not all it lacks
                 model = selector.led_on(selector.model(together, begun))
                 if selector.met(model) if train.exact else not selector.far(model):
                     return model
-        chosen, begun = min(nearest, key=lambda found: found[1].cost, default=([], fit))
+            led.append((together, begun))
+        chosen, begun = min(led, key=lambda found: found[1].cost)
         if not begun.cost < FURTHER * fit.cost:
             return None
         fit = begun

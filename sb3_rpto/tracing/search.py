@@ -205,10 +205,10 @@ def worth_a_look(selector: Selector, screening: Screening) -> list[int]:
 
 
 def search(on: Selectors, base: Model, screening: Screening, seed: int = 0) -> Selection:
-    """Looks for one kind and for single effects, joint fit of all candidates, elimination, substitution by like ones.
+    """Looks for few kinds and for single effects, joint fit of all candidates, elimination, substitution by like ones.
 
     The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there.
-    Where one kind or single effects meet exact data, nothing else is needed. One kind is looked for in measured data
+    Where a few kinds or single effects meet exact data, nothing else is needed. One kind is looked for in measured data
     too, where contacts hold larger fits in kinks and the declared parameters alone are far from the noise.
 
     Where the joint fit ends far from the noise and no nearer than the declared parameters alone, or worse than those,
@@ -223,7 +223,7 @@ def search(on: Selectors, base: Model, screening: Screening, seed: int = 0) -> S
     rough, looked_at = on.rough, worth_a_look(on.fine, screening)
     alone = rough.model((), base.fit)
     if rough.train.exact or (rough.train.touching and rough.far(alone)):
-        on.say(0.2, "looking for a single kind")
+        on.say(0.2, "looking for a few kinds")
         one = few_kinds(rough, screening, alone.fit)
         if one is not None:
             selection = settle(on, Selection(one), screening)
