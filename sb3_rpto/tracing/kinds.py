@@ -16,6 +16,8 @@ NEAREST = 3
 MOST = 3
 #: A further one is looked for where the nearest lowers the cost to less than this share.
 FURTHER = 0.8
+#: Beside the simplest whose cost is not so many times the lowest one.
+LIKE = 2.0
 
 
 def few_kinds(selector: Selector, screening: Screening, base: Fit) -> Model | None:
@@ -39,7 +41,7 @@ def few_kinds(selector: Selector, screening: Screening, base: Fit) -> Model | No
             together = [*chosen, *places]
             fits.append((together, train.fit(fit.values, selector.free(together), fit.starts, JOINT)))
         nearest = sorted(fits, key=lambda found: found[1].cost)[:NEAREST]
-        led = [(list[int](), fit)]
+        led = []
         for together, begun in sorted(nearest, key=lambda found: len(selector.free(found[0]))):
             begun = concentrated(train, begun, selector.free(together))
             if np.median(begun.errors) < max(FAR, TENTH * np.median(base.errors)):  # else kinks are not all it lacks
@@ -47,8 +49,10 @@ def few_kinds(selector: Selector, screening: Screening, base: Fit) -> Model | No
                 if selector.met(model) if train.exact else not selector.far(model):
                     return model
             led.append((together, begun))
-        chosen, begun = min(led, key=lambda found: found[1].cost)
-        if not begun.cost < FURTHER * fit.cost:
+        lowest = min([begun.cost for _, begun in led], default=np.inf)
+        if not lowest < FURTHER * fit.cost:
             return None
-        fit = begun
+        # What has many parameters takes up much of whatever is missing.
+        near = [found for found in led if found[1].cost < min(LIKE * lowest, fit.cost)]
+        chosen, fit = min(near, key=lambda found: len(selector.free(found[0])))
     return None

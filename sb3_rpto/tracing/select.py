@@ -210,6 +210,17 @@ class Selector:
         known = self._memory.get(key)
         return known if known is not None and known.fit.cost <= fit.cost else self._remembered(key, fit)
 
+    def _unbent(self, model: Model, begin: Fit) -> Model:
+        """As :meth:`model`, but with shapes fitted from their nulls: what was there beside them may have bent them.
+
+        A spring about another reference is one about its own and an offset, say.
+        """
+        shapes = np.isin(np.arange(self.simulation.size), self.free(model.effects)) & ~self.simulation.strength
+        if not shapes.any():
+            return model
+        values = np.where(shapes, self.simulation.null, begin.values)
+        return self.anew(model.effects, replace(begin, values=values, linear=None), REFIT)
+
     def _less(self, values: np.ndarray, key: Sequence[int]) -> np.ndarray:
         """Parameters at which all effects but the given and the known ones have no influence."""
         less = values.copy()
@@ -269,6 +280,8 @@ class Selector:
             reduced = None
             for drop in _bundles(order, trifles):
                 trial = self.model([e for e in current.effects if e not in drop], current.fit)
+                if self.met(current) and not self.met(trial):
+                    trial = self._unbent(trial, current.fit)
                 evidence = self.evidence(current, trial)
                 self.say(1 - len(trial.effects) / begun, f"{len(current.effects)} effects left, trying without some")
                 if not evidence.clear(*(self.limit(current) if limit is None else (limit, GAIN))):

@@ -5,13 +5,13 @@ import pytest
 from simulated import WITH_WHEEL, compiled, problem, recorded
 
 from sb3_rpto.effects.effect import Effect
-from sb3_rpto.effects.forces import TorqueOffset
+from sb3_rpto.effects.forces import Spring, TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, StribeckFriction, ViscousFriction
 from sb3_rpto.tracing import kinds
 from sb3_rpto.tracing.kinds import few_kinds
 from sb3_rpto.tracing.screen import screen
 from sb3_rpto.tracing.search import Selectors, search
-from sb3_rpto.tracing.select import THRESHOLD, Model, Selector
+from sb3_rpto.tracing.select import THRESHOLD, Model, Selection, Selector
 
 #: rad that count as noise of exact data
 EXACT = 1e-6
@@ -95,3 +95,14 @@ def test_driven_joints_are_a_kind_apart() -> None:
     s = Selector(problem(effects, recorded(model=model), model), None, THRESHOLD, lambda share, what: None)
     assert list(s.by_kind([0, 1, 2], apart=True).values()) == [[0], [1], [2]]
     assert list(s.by_kind([0, 1, 2]).values()) == [[0, 1], [2]]
+
+
+def test_an_offset_that_a_bent_spring_cancels_is_dropped() -> None:
+    """-k (q - r) - k r is -k q: both meet the data, and the spring alone does from its own reference."""
+    s = selector([Spring("hinge", stiffness=0.5)], candidates=[Spring("hinge"), TorqueOffset("hinge")])
+    both = s.model((0, 1), s.train.score(np.array([0.5, 0.4, -0.2])))
+    assert s.met(both)
+    alone = s.eliminate(Selection(both)).model
+    assert alone.effects == (0,)
+    assert s.met(alone)
+    assert alone.fit.values == pytest.approx([0.5, 0.0, 0.0], abs=1e-5)
