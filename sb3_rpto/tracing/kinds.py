@@ -23,8 +23,8 @@ LIKE = 2.0
 def few_kinds(selector: Selector, screening: Screening, base: Fit) -> Model | None:
     """The kinds that account for the data, if so few do: the simplest of the nearest that meets exact data.
 
-    Each is looked at alone; of exact data the nearest is then looked at with each other one, and so on, as one kind may
-    take up some of what another lacks while that is not there. Beside it others may show: longer legs, say, slip.
+    Each is looked at alone; of exact data the simplest of the nearest is kept and looked at with each other one, and
+    so on. Beside it others may show that did not before: longer legs, say, slip.
 
     :param selector: of the windows
     :param screening: of the candidates, beside the declared parameters alone
