@@ -48,10 +48,10 @@ METHOD = (
     "R compares the error of select windows with what the noise alone would leave in them, their starts being fitted. "
     "Where R reaches one, the model is complete and nothing more was tried.",
     "Otherwise each candidate effect was screened: could these data show it, and does it look like another?",
-    "Where the data are exact, or contacts come and go, one kind of effect at all its places was tried first, of exact "
-    "data up to three together, and then nothing else where they accounted for them. Else all candidates that could "
-    "show were fitted together. Of either, effects were dropped one by one: first those whose loss seems to cost least, "
-    "judged on the select windows, until all that remained were needed.",
+    "Where the data are exact, or contacts come and go, one kind of effect at all its places was tried first, of "
+    "exact data up to three together, and then nothing else where they accounted for them. Else all candidates that "
+    "could show were fitted together. Of either, effects were dropped one by one: first those whose loss seems to "
+    "cost least, judged on the select windows, until all that remained were needed.",
     "An effect is needed when its loss raises the log error of blocks of select windows clearly (t above the "
     "threshold) and by more than 3 %; far from the noise, where other missing effects spread the blocks, a t of 2 is "
     "enough and a tenth is needed. Where the typical window is met without it, the few that are missed speak for it by "
