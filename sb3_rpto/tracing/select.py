@@ -269,6 +269,8 @@ class Selector:
     def eliminate(self, outcome: Selection, limit: float | None = None) -> Selection:
         """Drop the effect whose removal costs least until all that remain have a t above the limit.
 
+        Of what meets exact data, kinds are tried as a whole, too: all places of one may cancel bent shapes of others.
+
         :param limit: default: :meth:`limit` of the model, with its gain
         """
         current, step = outcome.model, max((step for step, _ in outcome.dropped.values()), default=0)
@@ -278,9 +280,13 @@ class Selector:
             order, costs = self.removal_costs(current)
             trifles = [e for e in order if costs[e] < TRIFLE * current.fit.cost]
             reduced = None
-            for drop in _bundles(order, trifles):
+            met = self.met(current)
+            bundles = _bundles(order, trifles)
+            if met:
+                bundles += [kind for kind in self.by_kind(order).values() if 1 < len(kind) < len(order)]
+            for drop in bundles:
                 trial = self.model([e for e in current.effects if e not in drop], current.fit)
-                if self.met(current) and not self.met(trial):
+                if met and not self.met(trial):
                     trial = self._unbent(trial, current.fit)
                 evidence = self.evidence(current, trial)
                 self.say(1 - len(trial.effects) / begun, f"{len(current.effects)} effects left, trying without some")

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from simulated import WITH_WHEEL, compiled, problem, recorded
+from simulated import PENDULUM, WITH_WHEEL, compiled, problem, recorded
 
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import Spring, TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, StribeckFriction, ViscousFriction
-from sb3_rpto.tracing import kinds
+from sb3_rpto.tracing import kinds, select
 from sb3_rpto.tracing.kinds import few_kinds
 from sb3_rpto.tracing.screen import screen
 from sb3_rpto.tracing.search import Selectors, search
@@ -21,6 +21,11 @@ CANDIDATES: list[Effect] = [
     TorqueOffset("hinge"),
     ViscousFriction("hinge"),
 ]
+WITH_FOREARM = PENDULUM.replace(
+    "</body>",
+    """<body pos="0 0 -.5"><joint name="elbow" axis="0 -1 0" damping="0.05"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="0.5"/></body></body>""",
+)
 STRIBECK, COULOMB, OFFSET, VISCOUS = range(4)
 
 
@@ -106,3 +111,19 @@ def test_an_offset_that_a_bent_spring_cancels_is_dropped() -> None:
     assert alone.effects == (0,)
     assert s.met(alone)
     assert alone.fit.values == pytest.approx([0.5, 0.0, 0.0], abs=1e-5)
+
+
+def test_a_kind_goes_as_a_whole_where_none_of_its_places_can_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So it is with the six bent springs and five offsets of a HalfCheetah; here it is made so."""
+    monkeypatch.setattr(select, "_bundles", lambda order, trifles: [])
+    planted: list[Effect] = [Spring("hinge", stiffness=0.5), Spring("elbow", stiffness=0.5)]
+    candidates: list[Effect] = [Spring("hinge"), Spring("elbow"), TorqueOffset("hinge"), TorqueOffset("elbow")]
+    model = compiled(WITH_FOREARM)
+    train = problem(candidates, recorded(planted, noise=0.0, exact=True, model=model), model, noise=EXACT)
+    s = Selector(train, None, THRESHOLD, lambda share, what: None)
+    every = s.model((0, 1, 2, 3), s.train.score(np.array([0.5, 0.4, 0.5, -0.3, -0.2, 0.15])))
+    assert s.met(every)
+    springs = s.eliminate(Selection(every)).model
+    assert springs.effects == (0, 1)
+    assert s.met(springs)
+    assert springs.fit.values == pytest.approx([0.5, 0, 0.5, 0, 0, 0], abs=1e-4)
