@@ -3,12 +3,13 @@
     python examples/trace_targets.py --tasks cheetah --targets 0 1 2 3 4 5
     python examples/trace_targets.py --tasks hopper --targets 0 --noise 0.001
     python examples/trace_targets.py --tasks double-pendulum --targets 0 1 2 --sensors 0.001 0.005
+    python examples/trace_targets.py --tasks hopper --targets 0 1 --nothing-declared
 
 The targets are those of examples/closed_loop_study.py, by number, so that ones can be taken that nothing was tuned on.
 The source's policy acts in each for 200 steps, as at the beginning of a transfer; no policy learns. With --noise it is
 ten runs of at most 100 steps, of which a log shows positions alone, with that noise, at about 100 Hz. With --sensors it
-is the 200 steps, observed with that noise, which the trace is told. Finished traces are kept in --runs, the table goes
-to --out.
+is the 200 steps, observed with that noise, which the trace is told. With --nothing-declared the trace is not told which
+numbers may differ either. Finished traces are kept in --runs, the table goes to --out.
 """
 
 from __future__ import annotations
@@ -36,20 +37,21 @@ def main() -> None:
     parser.add_argument("--targets", nargs="+", type=int, default=list(range(6)))
     parser.add_argument("--noise", type=float, default=0.0, help="of a log's positions in rad or m (default: exact)")
     parser.add_argument("--sensors", nargs="+", type=float, default=[0.0], help="noise of observed positions")
+    parser.add_argument("--nothing-declared", action="store_true", help="tell the trace of no number that may differ")
     parser.add_argument("--workers", type=int, default=2, help="traces side by side")
     parser.add_argument("--runs", type=Path, default=Path("runs/trace_targets"), help="where single traces are kept")
     parser.add_argument("--out", type=Path, help="where the table goes")
     a = parser.parse_args()
-    a.out = a.out or Path(__file__).parent / "results" / (
-        "trace_logs" if a.noise else "trace_sensors" if any(a.sensors) else "trace_targets"
-    )
+    name = "trace_logs" if a.noise else "trace_sensors" if any(a.sensors) else "trace_targets"
+    a.out = a.out or Path(__file__).parent / "results" / (name + "_nothing_declared" * a.nothing_declared)
     for folder in (a.runs, a.out):
         folder.mkdir(parents=True, exist_ok=True)
     for task in a.tasks:
         study.source_agent(task, a.runs)
     # Target by target, so that an unfinished table is a fair sample.
     places = product(a.targets, a.sensors, a.tasks, a.shifts)
-    jobs = [Job(task, shift, target, target if noisy else 0, a.noise, noisy) for target, noisy, task, shift in places]
+    told = not a.nothing_declared
+    jobs = [Job(task, shift, i, i if noisy else 0, a.noise, noisy, told) for i, noisy, task, shift in places]
     with ProcessPoolExecutor(a.workers) as pool:
         rows = list(tqdm(pool.map(partial(run, folder=a.runs), jobs), total=len(jobs), desc="traces"))
     table = pd.DataFrame(rows).sort_values(["task", "sensors", "shift", "target"])
@@ -62,6 +64,7 @@ def main() -> None:
             "targets": a.targets,
             "noise": a.noise,
             "sensors": a.sensors,
+            "nothing declared": a.nothing_declared,
         },
         "versions": versions(),
         **machine(),

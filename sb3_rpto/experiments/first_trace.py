@@ -15,7 +15,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto.algorithms.closing import FIRST, horizon_of
-from sb3_rpto.effects import Declared, Effect
+from sb3_rpto.effects import LIBRARY, Declared, Effect
 from sb3_rpto.experiments.closed_loop import (
     SHIFTS,
     TASKS,
@@ -36,6 +36,8 @@ RUNS, STEPS, SAMPLED = 10, 100, 0.01
 #: a sine of so many Hz, whose phase nobody records.
 GUSTS, FORCE, FREQUENCY = "gusts", 20.0, 1.0
 CAUSES = (*SHIFTS, GUSTS)
+#: What shows that a number is another, where nobody declared it.
+SHOWN_AS = {"length": "link_length", "mass": "mass_scale", "friction": "geom_friction"}
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,7 @@ class Job:
     :param noise: standard deviation of a log's positions in rad or m, velocities not measured; 0: transitions
     :param sensors: that of the positions which transitions show, and ten times as many rad/s or m/s of the speeds,
         which the trace is told; 0: exact transitions
+    :param declared: whether the trace is told which numbers may differ
     """
 
     task: str
@@ -57,6 +60,7 @@ class Job:
     seed: int = 0
     noise: float = 0.0
     sensors: float = 0.0
+    declared: bool = True
 
     @property
     def planted(self) -> str:
@@ -99,14 +103,17 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
         numbers, seconds
     """
     how = f"_{job.noise:g}" if job.noise else f"_sensors_{job.sensors:g}" if job.sensors else ""
+    how += "" if job.declared else "_nothing-declared"
     path = folder / f"trace_{job.task}_{job.shift}_{job.target}_{job.seed}{how}.json"
     if not path.exists():
         source = make_source(job.task)
         data = noisy_log(job, folder) if job.noise else first_transitions(job, folder)
         horizon = None if job.noise else horizon_of(data, source)
-        began = time.perf_counter()
-        report = trace(source, data, TASKS[job.task].declared, seed=job.seed, horizon=horizon, threads=1)
+        began, names = time.perf_counter(), TASKS[job.task].declared if job.declared else ()
+        report = trace(source, data, names, seed=job.seed, horizon=horizon, threads=1)
         effects = shifted(job.task, job.planted, job.target)
+        if not job.declared:
+            effects = [undeclared(e) if isinstance(e, Declared) else e for e in effects]
         row = {**asdict(job), **judged(effects, report), "seconds": round(time.perf_counter() - began, 1)}
         write_json(path, row)
     return {**asdict(job), **json.loads(path.read_text())}
@@ -160,8 +167,16 @@ def noisy_log(job: Job, folder: Path) -> Measurements:
     return Measurements.from_tables(tables)
 
 
+def undeclared(number: Declared) -> Effect:
+    """The effect that shows that a number of the simulator is another, with its size."""
+    owner, _, parameter = number.label.rpartition(".")
+    (value,) = number.values
+    change = value - number.nominal if parameter == "friction" else value / number.nominal - 1
+    return LIBRARY[SHOWN_AS[parameter]](owner).with_values(np.array([change]))
+
+
 def judged(effects: Sequence[Effect], report: Report) -> dict[str, Any]:
-    """What a report says, beside what is true.
+    """What a report says, beside what is true; ``alike`` counts effects in place of a like one that is there.
 
     :param effects: what was put into the target
     """
@@ -181,13 +196,14 @@ def judged(effects: Sequence[Effect], report: Report) -> dict[str, Any]:
         "there": len(there),
         "named": len(named),
         "right": len(named & there),
+        "alike": sum(t.effect.label not in there and bool({*t.alike} & (there - named)) for t in report.effects),
         "named_effects": "; ".join(sorted(named)),
-        "declared_error_median": float(np.median(list(off.values()))),
+        "declared_error_median": float(np.median(list(off.values()))) if off else None,
         "true_effects_off": "; ".join(
-            f"{t.effect.values[0] / truth[t.effect.label] - 1:+.3f}" for t in report.effects if t.effect.label in there
+            f"{t.effect.values[0] / truth[t.effect.label] - 1:+.4f}" for t in report.effects if t.effect.label in there
         ),
         "intervals": len(held),
         "hold_the_truth": int(sum(held)),
-        "declared_error_max": float(max(off.values())),
-        "declared_worst": max(off, key=lambda label: off[label]),
+        "declared_error_max": float(max(off.values())) if off else None,
+        "declared_worst": max(off, key=lambda label: off[label], default=None),
     }

@@ -79,3 +79,14 @@ def test_a_trace_is_compared_with_the_truth_and_made_once(
     (folder / "trace_double-pendulum_undeclared_7_0.json").write_text('{"verdict": "kept"}')
     job = Job("double-pendulum", "undeclared", 7)
     assert run(job, folder) == {**asdict(job), "verdict": "kept"}
+
+
+def test_numbers_that_nobody_declared_are_compared_as_effects(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_trace, "FIRST", 120)
+    row = run(Job("double-pendulum", "declared", 0, declared=False), folder)
+    assert row["verdict"] == "explained"
+    # Of a cart that slides, a longer one and a heavier one are the same.
+    assert row["named_effects"] == "link_length(cart); link_length(pole); link_length(pole2)"
+    assert (row["there"], row["right"], row["alike"]) == (3, 2, 1)
+    assert [abs(float(off)) < 1e-3 for off in row["true_effects_off"].split("; ")] == [True] * 2
+    assert row["declared_worst"] is None
