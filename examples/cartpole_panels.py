@@ -25,9 +25,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from tqdm import tqdm
 
 import sb3_rpto  # noqa: F401  (registers the environment)
+from sb3_rpto.experiments.curve import evaluate
 from sb3_rpto.experiments.provenance import machine, versions
 from sb3_rpto.experiments.report import iqm_interval, summarise
-from sb3_rpto.experiments.run import evaluate, transfer
+from sb3_rpto.experiments.run import transfer
 from sb3_rpto.files import write_json
 
 SAC_SETTINGS = {"policy_kwargs": {"net_arch": [64, 64]}, "learning_rate": 1e-3, "gamma": 0.98, "tau": 0.01}

@@ -27,7 +27,7 @@ from transfer_double_pendulum import draw, source, source_policy
 from sb3_rpto import RPTO
 from sb3_rpto.experiments.baselines import fine_tuned_sac
 from sb3_rpto.experiments.closed_loop import TASKS, make_target, shifted
-from sb3_rpto.experiments.run import LearningCurve
+from sb3_rpto.experiments.curve import LearningCurve
 from sb3_rpto.tracing import Report
 
 TASK = "double-pendulum"

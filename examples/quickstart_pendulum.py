@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_rpto import RPTO
 from sb3_rpto.dynamics.products import fast_products
-from sb3_rpto.experiments.run import evaluate
+from sb3_rpto.experiments.curve import evaluate
 
 
 def pendulum(g: float) -> gym.Env:

@@ -27,7 +27,7 @@ from tqdm import tqdm
 from sb3_rpto import RPTO
 from sb3_rpto.algorithms.closing import LoopCloser
 from sb3_rpto.experiments.closed_loop import TASKS, make_source, make_target, source_agent
-from sb3_rpto.experiments.run import EVALUATION_SEED
+from sb3_rpto.experiments.curve import EVALUATION_SEED
 
 TASK, SHIFT, SEEDS = "double-pendulum", "none", range(3)
 BUDGET, EVERY, EPISODES, WHOLE = 1_000, 250, 40, 1_000

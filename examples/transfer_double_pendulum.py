@@ -30,7 +30,7 @@ from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.products import fast_products
 from sb3_rpto.experiments.baselines import fine_tuned_sac
-from sb3_rpto.experiments.run import LearningCurve
+from sb3_rpto.experiments.curve import LearningCurve
 
 #: Mean return in the source at which the policy counts as converged: 9,360 is the most there is.
 SOLVED = 9_300

@@ -16,7 +16,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
-from sb3_rpto.experiments.run import LearningCurve, MakeEnv
+from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
 from sb3_rpto.files import plain, write_json
 
 #: In a checkpoint: the class of its model, and the rows until then.
@@ -133,7 +133,7 @@ class SavedCurve(LearningCurve):
     :param total: steps of the run; after the last there is no checkpoint
     :param n_episodes: of an evaluation
     :param seed: of the evaluation's initial states
-    :param after_update: as that of :class:`~sb3_rpto.experiments.run.LearningCurve`
+    :param after_update: as that of :class:`~sb3_rpto.experiments.curve.LearningCurve`
     :param until: return at which the run ends early
     :param resumable: whether to leave checkpoints
     :param say: told of each row in a line

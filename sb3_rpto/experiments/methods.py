@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import gymnasium as gym
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -18,12 +17,8 @@ from sb3_rpto.algorithms.ptp import PTP
 from sb3_rpto.algorithms.slbo import SLBO
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.experiments import baselines
+from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
 from sb3_rpto.presets import resolve_preset
-
-if TYPE_CHECKING:
-    from sb3_rpto.experiments.run import LearningCurve
-
-MakeEnv = Callable[[], gym.Env]
 
 
 @dataclass(frozen=True)

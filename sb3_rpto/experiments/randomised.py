@@ -20,7 +20,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_rpto.effects import declare
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.experiments.baselines import fine_tuned_sac
-from sb3_rpto.experiments.methods import MakeEnv
+from sb3_rpto.experiments.curve import MakeEnv
 from sb3_rpto.files import write_json
 
 #: What a closed loop may spend in its corrected simulator, so that the two can be compared: updates, source steps for

@@ -16,7 +16,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_rpto.buffers import chronological, load_transitions
-from sb3_rpto.experiments.methods import MakeEnv
+from sb3_rpto.experiments.curve import MakeEnv
 from sb3_rpto.experiments.run import transfer
 from sb3_rpto.files import write_json
 

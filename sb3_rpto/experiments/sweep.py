@@ -22,10 +22,10 @@ import torch as th
 
 from sb3_rpto.envs.tasks import env_id, make_shift
 from sb3_rpto.experiments.ablation import ABLATED
-from sb3_rpto.experiments.methods import REGISTRY, MakeEnv, Run
+from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
+from sb3_rpto.experiments.methods import REGISTRY, Run
 from sb3_rpto.experiments.plan import Job, Place, Suite, jobs, listing
 from sb3_rpto.experiments.provenance import commit, constructor_arguments, machine, plain, versions
-from sb3_rpto.experiments.run import LearningCurve
 from sb3_rpto.experiments.sources import Reference, digest, reference, source_agent
 from sb3_rpto.experiments.suites import SUITES
 from sb3_rpto.files import write_json

@@ -20,8 +20,9 @@ from sb3_rpto.buffers import chronological
 from sb3_rpto.effects import declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments import baselines
+from sb3_rpto.experiments.curve import LearningCurve
 from sb3_rpto.experiments.methods import REGISTRY, Run
-from sb3_rpto.experiments.run import METHODS, LearningCurve, transfer
+from sb3_rpto.experiments.run import METHODS, transfer
 from sb3_rpto.presets import resolve_preset
 
 BUDGET, EPISODES = 60, 2

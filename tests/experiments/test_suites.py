@@ -21,9 +21,9 @@ from sb3_rpto import RPTO
 from sb3_rpto.algorithms.mbpo import MBPO
 from sb3_rpto.envs.tasks import TARGETS, TASKS, env_id, make_shift
 from sb3_rpto.experiments.ablation import ABLATED, FACTORS, WithoutRPO, cells
+from sb3_rpto.experiments.curve import LearningCurve
 from sb3_rpto.experiments.methods import REGISTRY, Run
 from sb3_rpto.experiments.plan import Job, Suite, jobs, listing
-from sb3_rpto.experiments.run import LearningCurve
 from sb3_rpto.experiments.suites import ABLATION, FURTHER, PAPER, PAPER_TASKS, QUICK, SUITES
 
 by_suite = pytest.mark.parametrize("suite", SUITES.values(), ids=SUITES)
