@@ -8,6 +8,7 @@ import importlib
 import os
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -103,7 +104,13 @@ def _add_trace(commands: Commands) -> None:
     )
     parser.add_argument("model", metavar="MODEL", help="MJCF file, or gymnasium id (Reacher-v5, package:name/Task-v0)")
     recordings.add(parser)
-    parser.add_argument("--out", metavar="DIR", required=True, type=Path, help="folder for the report and the model")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        required=True,
+        type=Path,
+        help="folder for the report and the model; those of an earlier trace are replaced",
+    )
     parser.add_argument(
         "--known",
         metavar="FILE",
@@ -164,10 +171,7 @@ def _trace(parsed: argparse.Namespace) -> int:
         save_corrected(trial, model, [])
     data = recordings.read(parsed.files, parsed.format)
     known = [] if parsed.known is None else read_effects(parsed.known, load_model(model)[1])
-    parsed.out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=parsed.out):
-        pass  # can be written to
-    with _progress(parsed.quiet) as progress:
+    with _folder(parsed.out), _progress(parsed.quiet) as progress:
         report = trace(
             model,
             data,
@@ -189,6 +193,21 @@ def _trace(parsed: argparse.Namespace) -> int:
     if not parsed.quiet:
         _say(f"\nwritten: {parsed.out / 'report.html'}")
     return 0
+
+
+@contextlib.contextmanager
+def _folder(path: Path) -> Iterator[None]:
+    """A folder that can be written to; one that was made here does not stay empty behind an error."""
+    made = not path.exists()
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        with tempfile.TemporaryFile(dir=path):
+            yield
+    except BaseException:
+        if made:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+        raise
 
 
 def _say(text: str) -> None:
@@ -214,7 +233,8 @@ def _model(name: str) -> Any:
     try:
         return gym.make(name)
     except (gym.error.Error, ModuleNotFoundError) as error:
-        raise ValueError(f"MODEL {name!r} is neither a file nor a gymnasium environment: {error}") from error
+        own = "; one of your own needs its module before it: module:name/Task-v0" if ":" not in name else ""
+        raise ValueError(f"MODEL {name!r} is neither a file nor a gymnasium environment: {error}{own}") from error
 
 
 @contextlib.contextmanager
@@ -225,7 +245,7 @@ def _progress(quiet: bool) -> Iterator[Callable[[float, str], None] | None]:
         return
     try:
         from rich.console import Console
-        from rich.progress import Progress
+        from rich.progress import Progress, TimeElapsedColumn
     except ImportError:
         yield _lines()
         return
@@ -233,17 +253,17 @@ def _progress(quiet: bool) -> Iterator[Callable[[float, str], None] | None]:
     if not console.is_terminal:
         yield _lines()
         return
-    with Progress(console=console, transient=True) as bar:
+    with Progress(*Progress.get_default_columns()[:-1], TimeElapsedColumn(), console=console, transient=True) as bar:
         task = bar.add_task("reading", total=1.0)
         yield lambda share, what: bar.update(task, completed=share, description=what)
 
 
 def _lines() -> Callable[[float, str], None]:
-    last = [""]
+    last, began = [""], time.monotonic()
 
     def say(share: float, what: str) -> None:
         if what != last[0]:
-            print(f"[{share:4.0%}] {what}", file=sys.stderr)
+            print(f"[{share:4.0%}, {time.monotonic() - began:.0f} s] {what}", file=sys.stderr)
         last[0] = what
 
     return say

@@ -80,6 +80,17 @@ def test_a_file_is_no_folder_to_write_to(files: Path, capsys: pytest.CaptureFixt
     assert "is a file; give a folder" in error(capsys)
 
 
+def test_bad_input_leaves_no_folder(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = (files / "runs.csv").read_text().splitlines()
+    (tmp_path / "short.csv").write_text("\n".join(rows[:20]) + "\n")
+    arguments = ["trace", str(files / "robot.xml"), str(tmp_path / "short.csv"), "--quiet", "--out"]
+    assert cli.main([*arguments, str(tmp_path / "out")]) == 2
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "mine").mkdir()
+    assert cli.main([*arguments, str(tmp_path / "mine")]) == 2
+    assert (tmp_path / "mine").exists()
+
+
 def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(files, "--quiet", "--format", "csv", "--horizon", "0.15") == 0
     captured = capsys.readouterr()
@@ -97,6 +108,7 @@ def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixtu
         ({"model": "absent.xml"}, "there is no MJCF file"),
         ({"model": "broken.xml"}, "broken.xml"),
         ({"model": "Nothing-v7"}, "neither a file nor a gymnasium environment"),
+        ({"model": "mine/Crane-v0"}, "module:name/Task-v0"),
         ({"model": "no_such_package:Nothing-v7"}, "neither a file nor a gymnasium environment"),
         ({"model": "CartPole-v1"}, "no MuJoCo model"),
         ({"options": ["--declare", "hinge.dampng"]}, "damping"),

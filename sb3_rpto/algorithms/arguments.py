@@ -128,7 +128,7 @@ def list_of_names(declared: Sequence[str]) -> tuple[str, ...]:
             "declared must be a list of names, not a mapping; bounds are part of a name: 'pole.length=0.1:1'"
         )
     if not isinstance(declared, Sequence) or not all(isinstance(name, str) for name in declared):
-        raise TypeError(f"declared must be a list of names, not {declared!r}")
+        raise TypeError(f"declared must be a list of names, not {declared!r}; write [] for none")
     return tuple(declared)
 
 

@@ -21,7 +21,7 @@ from sb3_rpto.envs.observations import env_name, layers, leaves_observations
 from sb3_rpto.envs.rules import Rule, task_rules
 from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Episode, Measurements
-from sb3_rpto.tracing.model_checks import check_names
+from sb3_rpto.tracing.model_checks import check_clock, check_names
 from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, half_step, start_state, straight
 from sb3_rpto.tracing.windows import command_order, held, noise_levels
 
@@ -35,7 +35,7 @@ def check_log(measured: Measurements, env: gym.Env) -> None:
     :param measured: the log
     :param env: the source
     :raises ValueError: no gymnasium MuJoCo environment, actions that are not the commands of the actuators, joints or
-        actuators that are not in both, observations that do not follow from the state
+        actuators that are not in both, a clock that is not in seconds, observations that do not follow from the state
     """
     base: Any = env.unwrapped
     if not isinstance(getattr(base, "model", None), mujoco.MjModel) or not callable(getattr(base, "_get_obs", None)):
@@ -44,6 +44,7 @@ def check_log(measured: Measurements, env: gym.Env) -> None:
             f"{env_name(env)} is not; pass a replay buffer or an .npz of its transitions"
         )
     check_names(base.model, measured)
+    check_clock(base.model, measured)
     check_commands(env, "target_data=Measurements")
     for layer in layers(env)[:-1]:
         if isinstance(layer, REMEMBERING) or not (

@@ -162,8 +162,9 @@ def _find(model: mujoco.MjModel, name: str) -> tuple[str, int, Number]:
     having = [kind for kind in candidates if parameter in NUMBERS[kind]]
     if not having:
         known = [p for kind in candidates for p in NUMBERS[kind]]
+        has = "has" if len(candidates) == 1 else "have"
         raise ValueError(
-            f"{name!r}: {' and '.join(candidates)} {owner!r} has no {parameter!r}; {near(parameter, known)}"
+            f"{name!r}: {' and '.join(candidates)} {owner!r} {has} no {parameter!r}; {near(parameter, known)}"
         )
     if len(having) > 1:
         raise ValueError(f"{name!r} may be of {' or '.join(having)}; write '{having[0]}:{name}'")

@@ -65,7 +65,7 @@ def check_against(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     """
     check_names(model, data)
     _check_actuators(model)
-    _check_clock(model, data)
+    check_clock(model, data)
     _check_settings(model, data)
     return _sampling(model, data) + _clipped(model, data) + _responses(model, data)
 
@@ -143,8 +143,11 @@ def soft_ties(model: mujoco.MjModel) -> list[Finding]:
     return found
 
 
-def _check_clock(model: mujoco.MjModel, data: Measurements) -> None:
-    """Refuse samples so far apart that their times can hardly be in seconds."""
+def check_clock(model: mujoco.MjModel, data: Measurements) -> None:
+    """Refuse samples so far apart, or so near to each other, that their times can hardly be in seconds.
+
+    :raises ValueError: see :func:`check_against`
+    """
     steps = [np.diff(e.time) for e in data.episodes if len(e) > 1]
     step = float(np.median(np.concatenate(steps))) if steps else 0.0
     if not data.exact and step > LONGEST_STEP:

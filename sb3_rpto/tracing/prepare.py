@@ -277,7 +277,7 @@ def windows(
     if (few or not train.whole_states) and len(np.unique(every.block)) < 3:
         enough = sum(float(np.ptp(e.time)) for e in train.episodes) > 2 * BLOCK  # for a third block to begin
         raise ValueError(
-            f"the training runs hold {len(every)} window(s) of {horizon:g} s in fewer than three blocks of a "
+            f"the training runs hold {len(every)} window(s) of {horizon:.2g} s in fewer than three blocks of a "
             f"second: too few to select on; record longer, three runs or {math.ceil(2 * BLOCK + horizon + MEMORY):g} s "
             f"and more to fit to{', or lower horizon' if enough else ''}"
         )

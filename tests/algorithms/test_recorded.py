@@ -193,6 +193,13 @@ def test_a_log_of_another_machine_is_refused(env: str, said: str) -> None:
         model(log(), env=gym.make(env), dynamics="ensemble", declared=())
 
 
+def test_a_clock_that_is_not_in_seconds_is_refused_before_anything_is_done() -> None:
+    columns = {name: values for name, values in table(episodes=1).items() if name != "true"}
+    measured = Measurements.from_tables({"log": {**columns, "time": 1e3 * columns["time"]}})
+    with pytest.raises(ValueError, match=r"'time' is 10 s.*are these milliseconds"):
+        model(measured)
+
+
 def test_wrappers_that_a_log_does_not_tell_of_are_refused() -> None:
     env = gym.make(TASK)
     for wrapped, said in (
