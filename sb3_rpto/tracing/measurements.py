@@ -94,6 +94,10 @@ class Measurements:
         names = f"joints {', '.join(self.joints)}; actuators {', '.join(self.actuators) or 'none'}"
         return f"<Measurements: {len(self.episodes)} episodes, {samples} samples, {seconds:.4g} s; {names}>"
 
+    def __str__(self) -> str:
+        """That line, and what was found, each kind once."""
+        return "\n".join([repr(self), *(f"  {finding}" for finding in checks.grouped(self.findings))])
+
     @classmethod
     def from_csv(cls, paths: Paths) -> "Measurements":
         """Read CSV files, also gzipped (``.csv.gz``); a file without an ``episode`` column is one episode.

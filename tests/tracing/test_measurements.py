@@ -1,6 +1,7 @@
 import builtins
 import gzip
 import re
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -51,7 +52,10 @@ def write_csv(path, table):
 
 
 def test_it_prints_in_a_line():
-    assert repr(several(2)) == "<Measurements: 2 episodes, 400 samples, 3.98 s; joints hinge; actuators motor>"
+    data = several(2)
+    assert repr(data) == str(data) == "<Measurements: 2 episodes, 400 samples, 3.98 s; joints hinge; actuators motor>"
+    gaps = [checks.Finding("gap", f"episode {i}", "cut in two") for i in range(3)]
+    assert str(replace(data, findings=gaps)) == f"{data!r}\n  gap in episode 0 and 2 more: cut in two"
 
 
 def test_clean_data_have_no_findings():
