@@ -113,7 +113,7 @@ def run(job: Job, folder: Path) -> dict[str, Any]:
         report = trace(source, data, names, seed=job.seed, horizon=horizon, threads=1)
         effects = shifted(job.task, job.planted, job.target)
         if not job.declared:
-            effects = [undeclared(e) if isinstance(e, Declared) else e for e in effects]
+            effects = [as_effect(e) if isinstance(e, Declared) else e for e in effects]
         row = {**asdict(job), **judged(effects, report), "seconds": round(time.perf_counter() - began, 1)}
         write_json(path, row)
     return {**asdict(job), **json.loads(path.read_text())}
@@ -167,7 +167,7 @@ def noisy_log(job: Job, folder: Path) -> Measurements:
     return Measurements.from_tables(tables)
 
 
-def undeclared(number: Declared) -> Effect:
+def as_effect(number: Declared) -> Effect:
     """The effect that shows that a number of the simulator is another, with its size."""
     owner, _, parameter = number.label.rpartition(".")
     (value,) = number.values
