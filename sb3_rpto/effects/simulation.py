@@ -18,6 +18,8 @@ from sb3_rpto.effects.world import BatchWorld, World
 
 #: After so many time constants a filter has forgotten.
 CONSTANTS = 5
+#: Batches that are kept for further rollouts, large ones and the few kinds that they are of.
+KEPT = 8
 
 
 class Drive(NamedTuple):
@@ -92,9 +94,8 @@ class Simulation:
         known, active = self.from_settings(drive.settings), self.active(values)
         commands = filter_commands(active, drive.commands, self.model.opt.timestep)
         world = self._world(n, [*known, *active])
-        world.restore()
         world.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        prepare(world, [*known, *active])
+        self._prepare(world, [*known, *active])
         out_q = np.empty((n, steps + 1, self.model.nq))
         out_v = np.empty((n, steps + 1, self.model.nv))
         out_q[:, 0], out_v[:, 0] = qpos, qvel
@@ -193,13 +194,24 @@ class Simulation:
             world.qpos[:], world.qvel[:], world.ctrl[:] = qpos, qvel, past[:, k]
             world.batch.step()
 
+    def _prepare(self, world: BatchWorld, active: Active) -> None:
+        """As :func:`prepare`, but once for all simulations that are alike, as most are in a fit."""
+        first, kind = alike(active, world.n)
+        if 2 * len(first) > world.n:
+            prepare(world, active)
+        else:
+            few = self._world(len(first), active)
+            prepare(few, [(effect, x[first]) for effect, x in active])
+            world.settle_as(few, kind)
+
     def _world(self, n: int, active: Active) -> BatchWorld:
-        """One of the last few batches, or a new one: a field once written is copied in every step from then on."""
+        """One of the last few batches, as the model is: a field once written is copied in every step from then on."""
         key = (n, *(id(effect) for effect, _ in active))
         if key not in self._worlds:
-            if len(self._worlds) >= 4:
+            if len(self._worlds) >= KEPT:
                 self._worlds.pop(next(iter(self._worlds)))
             self._worlds[key] = BatchWorld(self.model, n, self.nthread)
+        self._worlds[key].restore()
         return self._worlds[key]
 
     def from_settings(self, settings: Mapping[str, np.ndarray]) -> Active:
@@ -211,6 +223,14 @@ class Simulation:
 
 
 Active = Sequence[tuple[Effect, np.ndarray]]
+
+
+def alike(active: Active, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of ``n`` simulations the first of each kind by its parameters, (k,), and the kind of each, (n,)."""
+    values = np.concatenate([np.empty((n, 0)), *(x for _, x in active)], axis=1)
+    begins = np.flatnonzero(np.concatenate([[True], (values[1:] != values[:-1]).any(axis=1)]))
+    _, first, kind = np.unique(values[begins], axis=0, return_index=True, return_inverse=True)
+    return begins[first], np.repeat(kind.ravel(), np.diff(begins, append=n))
 
 
 def prepare(world: World, active: Active) -> None:

@@ -63,6 +63,9 @@ class World(ABC):
         """Derive the constants that follow from the fields, and keep the level of dry friction."""
         if any(name in _DERIVING for name in self._nominal):
             self.derive()
+        self._keep_friction()
+
+    def _keep_friction(self) -> None:
         self._dry[:] = False
         self._base_friction = None
         if "dof_frictionloss" in self._nominal:
@@ -119,6 +122,19 @@ class BatchWorld(World):
 
     def _live(self, name: str) -> np.ndarray:
         return self.batch.expand(name)
+
+    def settle_as(self, few: "BatchWorld", kind: np.ndarray) -> None:
+        """Take the fields of another world that has settled, and the constants that follow from them.
+
+        :param few: of the same model
+        :param kind: which of its simulations each one here is like, (n,)
+        """
+        for name in few._nominal:
+            self.field(name)[:] = few._live(name)[kind]
+        for name in mujoco.MjModel._setconst_outputs:
+            if few.batch.expanded(name) is not None:
+                self._live(name)[:] = few._live(name)[kind]
+        self._keep_friction()
 
     def derive(self) -> None:
         """As in :class:`World`; once for all simulations whose fields are alike, as many are in a fit."""

@@ -333,7 +333,7 @@ def test_the_corrected_simulator_comes_back_from_a_checkpoint(tmp_path: Path) ->
 @pytest.mark.parametrize("stop", [60, 90], ids=["before the trace", "after it"])
 def test_a_loop_that_was_stopped_goes_on_as_if_it_had_not_been(stop: int, soon: None, tmp_path: Path) -> None:
     def begun() -> RPTO:
-        return model(friction()).learn(stop, source_timesteps=100)
+        return model(friction(), close_loop=["coulomb_friction"]).learn(stop, source_timesteps=100)
 
     unbroken = begun().learn(100 - stop, reset_num_timesteps=False)
     stopped = begun()

@@ -5,8 +5,11 @@ from itertools import permutations, product
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sb3_rpto.effects import LIBRARY, Drive, Effect, Simulation, declare
+from sb3_rpto.effects.simulation import alike
 from sb3_rpto.effects.world import BatchWorld
 
 XML = """
@@ -129,6 +132,33 @@ def test_an_effect_at_rest_leaves_nothing_behind_to_copy_in_every_step() -> None
         batch = list(simulation._worlds.values())[-1].batch
         expanded.append([name for name in ("dof_damping", "dof_armature") if batch.expanded(name) is not None])
     assert expanded == [["dof_damping"], ["dof_armature"], []]
+
+
+def test_what_is_written_once_for_many_simulations_is_what_is_written_for_each() -> None:
+    """Rows of two kinds in an uneven order, and settings that part one of them: as with as many kinds as rows."""
+    lacks = [LIBRARY["coulomb_friction"]("elbow"), LIBRARY["gravity_scale"]()]
+    sim = Simulation(MODEL, [*declare(MODEL, ["lower.length", "upper.mass", "m2.kp"]), *lacks], 1)
+    kinds = sim.null + np.array([[0.05, 0.1, 1.0, 0.2, 0.1], [0.06, 0.1, 1.5, 0.3, 0.1]])
+    values = kinds[[0, 0, 1, 1, 1, 0, 0, 1]]
+    damping = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.3, 0.3, 0.02])
+    qpos, qvel, commands = start(8, 30)
+    together = sim.rollout(values, qpos, qvel, Drive(commands, settings={"elbow.damping": damping}))
+    for i in range(8):
+        drive = Drive(commands[i : i + 1], settings={"elbow.damping": damping[i : i + 1]})
+        alone = sim.rollout(values[i : i + 1], qpos[i : i + 1], qvel[i : i + 1], drive)
+        assert equal(alone, tuple(part[i : i + 1] for part in together))
+
+
+@given(st.lists(st.integers(0, 3), min_size=1, max_size=12), st.lists(st.booleans(), min_size=12, max_size=12))
+def test_simulations_are_alike_where_all_their_parameters_are(levels: list[int], offsets: list[bool]) -> None:
+    n, effect = len(levels), LIBRARY["torque_offset"]("elbow")
+    rows = list(zip(levels, offsets))
+    active = [(effect, np.array(column, dtype=float)[:, None]) for column in zip(*rows)]
+    first, kind = alike(active, n)
+    assert [rows[i] for i in first[kind]] == rows
+    assert len(first) == len(set(rows))
+    assert all(rows.index(rows[i]) == i for i in first)
+    assert [part.tolist() for part in alike([], n)] == [[0], [0] * n]
 
 
 def test_actuators_that_are_off_do_nothing() -> None:

@@ -121,15 +121,15 @@ def test_friction_that_creeps_as_mujocos_does_by_default_is_told(constraint: str
     for run in range(4):
         data, rows = mujoco.MjData(model), []
         data.qpos[0], phase = rng.uniform(-1, 1), rng.uniform(0, 6)
-        for _ in range(250):
+        for _ in range(150):
             data.ctrl[0] = 0.9 * np.sin(phase + 2.0 * data.time)
             rows.append((data.time, data.qpos[0] + rng.normal(0, 5e-4), data.ctrl[0]))
             mujoco.mj_step(model, data, 10)
         tables[f"run{run}"] = dict(zip(("time", "qpos.hinge", "ctrl.motor"), np.array(rows).T))
     known = [LIBRARY["coulomb_friction"]("hinge", level=0.3)]
-    report = trace(
-        HINGED.format(""), Measurements.from_tables(tables), ["hinge.damping"], known=known, candidates=[], threads=1
-    )
+    coarse = HINGED.format("").replace('timestep="0.001"', 'timestep="0.004"')  # fine enough without the constraint
+    data = Measurements.from_tables(tables)
+    report = trace(coarse, data, ["hinge.damping"], known=known, candidates=[], threads=1)
     assert (report.verdict == "complete") == bool(constraint)
     told = [f.where for f in report.findings if f.kind == "soft friction"]
     assert told == ([] if constraint else ["coulomb_friction(hinge)"])

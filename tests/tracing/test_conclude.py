@@ -24,7 +24,7 @@ KINDS = ["coulomb_friction", "stribeck_friction", "torque_offset"]
 @pytest.mark.parametrize("noise", [0.0, 2e-4], ids=["exact", "noisy"])
 def test_dry_friction_is_found_as_the_robot_has_it(kind: str, noise: float) -> None:
     data = recorded([LIBRARY[kind]("hinge", level=0.3)], compiled(OWN), noise=noise, exact=not noise)
-    report = trace(OWN, data, ["pole.mass"], candidates=KINDS, simulated=True, threads=1)
+    report = trace(OWN, data, ["pole.mass"], candidates=KINDS, horizon=0.2, simulated=True, threads=1)
     assert report.verdict == "explained"
     assert [traced.label for traced in report.effects] == [f"{kind}(hinge)"]
     assert report.effects[0].effect.values == pytest.approx([0.3], rel=1e-2 if noise else 1e-6)

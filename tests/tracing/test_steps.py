@@ -24,7 +24,7 @@ def crank(friction: str, late: int = 0) -> Measurements:
     model, rng, tables = mujoco.MjModel.from_xml_string(CRANK.format(friction=friction)), np.random.default_rng(1), {}
     model.opt.timestep, model.opt.integrator = 2e-4, int(mujoco.mjtIntegrator.mjINT_RK4)
     for run in range(5):
-        data, t = mujoco.MjData(model), np.arange(750) / 250
+        data, t = mujoco.MjData(model), np.arange(500) / 250
         frequencies, phases = rng.uniform(0.3, 2.5, (4, 1)), rng.uniform(0, 6.28, (4, 1))
         torque, position = np.sin(2 * np.pi * frequencies * t + phases).sum(0), []
         for now in torque:
