@@ -18,8 +18,8 @@ from sb3_rpto.effects.world import BatchWorld, World
 
 #: After so many time constants a filter has forgotten.
 CONSTANTS = 5
-#: Batches that are kept for further rollouts, large ones and the few kinds that they are of.
-KEPT = 8
+#: Batches that are kept for further rollouts, and as many of the few kinds that their simulations are of.
+KEPT = 4
 
 
 class Drive(NamedTuple):
@@ -72,6 +72,7 @@ class Simulation:
         self.strength = np.array([not p.shape for e in self.effects for p in e.parameters], dtype=bool)
         self._settings: dict[str, Declared] = {}
         self._worlds: dict[tuple[int, ...], BatchWorld] = {}
+        self._kinds: dict[tuple[int, ...], BatchWorld] = {}
 
     def values(self) -> np.ndarray:
         """The effects' own values, (p,)."""
@@ -93,7 +94,7 @@ class Simulation:
         steps = total - drive.before
         known, active = self.from_settings(drive.settings), self.active(values)
         commands = filter_commands(active, drive.commands, self.model.opt.timestep)
-        world = self._world(n, [*known, *active])
+        world = self._world(self._worlds, n, [*known, *active])
         world.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         self._prepare(world, [*known, *active])
         out_q = np.empty((n, steps + 1, self.model.nq))
@@ -200,19 +201,19 @@ class Simulation:
         if 2 * len(first) > world.n:
             prepare(world, active)
         else:
-            few = self._world(len(first), active)
+            few = self._world(self._kinds, len(first), active)
             prepare(few, [(effect, x[first]) for effect, x in active])
             world.settle_as(few, kind)
 
-    def _world(self, n: int, active: Active) -> BatchWorld:
+    def _world(self, kept: dict[tuple[int, ...], BatchWorld], n: int, active: Active) -> BatchWorld:
         """One of the last few batches, as the model is: a field once written is copied in every step from then on."""
         key = (n, *(id(effect) for effect, _ in active))
-        if key not in self._worlds:
-            if len(self._worlds) >= KEPT:
-                self._worlds.pop(next(iter(self._worlds)))
-            self._worlds[key] = BatchWorld(self.model, n, self.nthread)
-        self._worlds[key].restore()
-        return self._worlds[key]
+        if key not in kept:
+            if len(kept) >= KEPT:
+                kept.pop(next(iter(kept)))
+            kept[key] = BatchWorld(self.model, n, self.nthread)
+        kept[key].restore()
+        return kept[key]
 
     def from_settings(self, settings: Mapping[str, np.ndarray]) -> Active:
         """Parameters that are known of each simulation, by declared name, (n,), as effects with their values."""

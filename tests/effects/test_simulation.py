@@ -135,7 +135,7 @@ def test_an_effect_at_rest_leaves_nothing_behind_to_copy_in_every_step() -> None
 
 
 def test_what_is_written_once_for_many_simulations_is_what_is_written_for_each() -> None:
-    """Rows of two kinds in an uneven order, and settings that part one of them: as with as many kinds as rows."""
+    """Rows of two kinds in an uneven order, and settings that part one of them."""
     lacks = [LIBRARY["coulomb_friction"]("elbow"), LIBRARY["gravity_scale"]()]
     sim = Simulation(MODEL, [*declare(MODEL, ["lower.length", "upper.mass", "m2.kp"]), *lacks], 1)
     kinds = sim.null + np.array([[0.05, 0.1, 1.0, 0.2, 0.1], [0.06, 0.1, 1.5, 0.3, 0.1]])
