@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint setup clean
+.PHONY: demo test test-all lint setup clean
 
 setup: .venv/.ready
 
@@ -21,8 +21,14 @@ lint: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+
 test: setup lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+	$(PYTEST) -m "not slow"
+
+# The slow ones too: traces of whole machines, a third of the time of all tests.
+test-all: setup lint
+	$(PYTEST)
 
 clean:
 	rm -rf .venv runs

@@ -189,6 +189,7 @@ def test_a_model_that_cannot_be_saved_fails_before_the_work(
     assert "tip.obj is gone" in error(capsys)
 
 
+@pytest.mark.slow
 def test_the_report_is_written_where_the_model_cannot_be(
     files: Path, found: Report, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

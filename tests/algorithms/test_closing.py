@@ -90,6 +90,7 @@ def test_an_undeclared_effect_is_named_added_and_fitted() -> None:
     assert values["pole.length"] == pytest.approx(LENGTH * 0.6, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_target_with_frictionloss_alone_is_explained(soon: None) -> None:
     """Nobody who sets it by hand makes it hold as a machine's does."""
     shifted = target([])
@@ -103,6 +104,7 @@ def test_a_target_with_frictionloss_alone_is_explained(soon: None) -> None:
     assert dynamics(made).error(made.transitions("target")) < 1e-3, "the simulator gives way as the target does"
 
 
+@pytest.mark.slow
 def test_a_target_that_queues_actions_is_met_from_the_first_step_of_an_episode_on(soon: None, tmp_path: Path) -> None:
     made = model([], target_env=Queue(target([])), close_loop=["command_delay", "torque_offset"])
     made.learn(81, source_timesteps=4)
@@ -156,6 +158,7 @@ def test_an_empty_list_traces_the_declared_numbers_alone(soon: None, monkeypatch
     assert began == [80]
 
 
+@pytest.mark.slow
 def test_a_trace_knows_the_effects_that_were_passed(soon: None) -> None:
     late = LIBRARY["command_delay"]("slide", delay=0.1)
     passed = {"effects": [late.with_values(np.array([0.08])).to_json()]}
@@ -190,6 +193,7 @@ def learned_from_noise() -> RPTO:
         return made.learn(170, source_timesteps=180)
 
 
+@pytest.mark.slow
 def test_what_noisy_sensors_show_is_explained_all_the_same() -> None:
     made = learned_from_noise()
     assert made.loop is not None
@@ -216,6 +220,7 @@ def test_of_another_target_nothing_is_kept() -> None:
     assert not loop.keeps_phi
 
 
+@pytest.mark.slow
 def test_phi_goes_on_being_fitted_where_what_was_traced_is_refused(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     made = filled(friction(), dynamics_kwargs={"observation_noise": 1e-4})
     assert made.loop is not None
@@ -330,7 +335,9 @@ def test_the_corrected_simulator_comes_back_from_a_checkpoint(tmp_path: Path) ->
     assert loaded.loop.found[0]["verdict"] == "explained"
 
 
-@pytest.mark.parametrize("stop", [60, 90], ids=["before the trace", "after it"])
+@pytest.mark.parametrize(
+    "stop", [pytest.param(60, id="before the trace"), pytest.param(90, id="after it", marks=pytest.mark.slow)]
+)
 def test_a_loop_that_was_stopped_goes_on_as_if_it_had_not_been(stop: int, soon: None, tmp_path: Path) -> None:
     def begun() -> RPTO:
         return model(friction(), close_loop=["coulomb_friction"]).learn(stop, source_timesteps=100)
@@ -388,6 +395,7 @@ def test_nothing_is_added_where_nothing_is_missing(soon: None) -> None:
     assert dynamics(made).names == ["pole.length"]
 
 
+@pytest.mark.slow
 def test_what_other_declared_numbers_produced_is_dropped_too(soon: None) -> None:
     made = model([])
     made.learn(1, source_timesteps=60)
@@ -1050,6 +1058,7 @@ def test_the_actor_sees_the_simulators_states_alone_where_it_accounts_for_the_ta
     assert worlds == ({-1.0} if accounts else {-1.0, 1.0})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("accounts", "share"), [(True, 0.0), (False, 0.5)])
 def test_the_critic_sees_no_estimated_states_where_the_simulator_accounts_for_a_log(
     accounts: bool, share: float
@@ -1062,6 +1071,7 @@ def test_the_critic_sees_no_estimated_states_where_the_simulator_accounts_for_a_
     assert [float(batch.rewards.mean()) for batch in made.critic_batches(3, 16)] == [share] * 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("accounts", "updates"), [(True, 10), (False, 20)])
 def test_many_steps_are_taken_for_each_update_where_the_simulator_accounts_for_a_log(
     accounts: bool, updates: int
@@ -1280,6 +1290,7 @@ def test_a_reward_that_is_no_number_is_said_in_a_rehearsal_too(monkeypatch: pyte
         made.loop.watch(made)
 
 
+@pytest.mark.slow
 def test_a_policy_is_rehearsed_where_a_log_was_traced_and_no_step_of_the_budget_is_spent_on_it() -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)

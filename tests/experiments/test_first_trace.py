@@ -65,6 +65,7 @@ def test_gusts_push_the_cart_and_nobody_records_them(folder: Path) -> None:
     assert np.abs(a.qpos[:n, 0] - b.qpos[:n, 0]).max() > 5e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shift", "named"), [("undeclared", "coulomb_friction(slider)"), ("none", "")])
 def test_a_trace_is_compared_with_the_truth_and_made_once(
     shift: str, named: str, folder: Path, monkeypatch: pytest.MonkeyPatch

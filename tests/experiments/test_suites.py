@@ -180,6 +180,7 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("suite", [QUICK, ABLATION], ids=["quick", "ablation"])
 def test_every_variant_of_a_small_suite_runs(

@@ -7,6 +7,7 @@ import pytest
 from sb3_rpto.experiments import threshold
 
 
+@pytest.mark.slow
 def test_a_complete_set_needs_a_threshold() -> None:
     row = threshold.needed("pendulum", 1e-3, 1, episodes=6, duration=2.0)
     assert row["candidates"] > 5

@@ -561,6 +561,7 @@ def test_a_small_case_from_end_to_end():
     assert found["errors"]["true"] is None
 
 
+@pytest.mark.slow
 def test_the_true_structure_takes_the_error_away(monkeypatch):
     case = CASES["single-coulomb_friction-small-pendulum-1mrad"]
 

@@ -114,6 +114,7 @@ HINGED = """<mujoco><option timestep="0.001" integrator="RK4"/><worldbody><body>
 HOLDS = 'solreffriction="0.002 1" solimpfriction="0.99 0.99"'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("constraint", ["", HOLDS], ids=["creeps", "holds"])
 def test_friction_that_creeps_as_mujocos_does_by_default_is_told(constraint: str) -> None:
     model = mujoco.MjModel.from_xml_string(HINGED.format(f'frictionloss="0.3" {constraint}'))

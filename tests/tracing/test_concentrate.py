@@ -49,6 +49,7 @@ def lengths() -> Problem:
     return Problem(simulation, cut(model, data, noise_levels(data), HORIZON, 40), scales)
 
 
+@pytest.mark.slow
 def test_a_walkers_lengths_are_found_where_contacts_hold_a_plain_fit() -> None:
     problem = lengths()
     free = np.arange(len(TRUE))
@@ -61,6 +62,7 @@ def test_a_walkers_lengths_are_found_where_contacts_hold_a_plain_fit() -> None:
     np.testing.assert_allclose(led.values, true, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_trace_of_a_walker_without_missing_effect_names_none() -> None:
     report = trace(gym.make("HalfCheetah-v5"), walk(steps=120), NAMES, horizon=HORIZON, threads=1)
     assert report.verdict == "complete"
@@ -113,6 +115,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return costs
 
 
+@pytest.mark.slow
 def test_exact_data_that_still_err_are_fitted_anew_beside_the_best_until_that_does_not_pay(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

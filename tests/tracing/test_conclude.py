@@ -20,6 +20,7 @@ OWN = """<mujoco><option timestep="0.005"/><worldbody><body name="pole">
 KINDS = ["coulomb_friction", "stribeck_friction", "torque_offset"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["soft_friction", "coulomb_friction"])
 @pytest.mark.parametrize("noise", [0.0, 2e-4], ids=["exact", "noisy"])
 def test_dry_friction_is_found_as_the_robot_has_it(kind: str, noise: float) -> None:
@@ -106,6 +107,7 @@ def test_another_gravity_is_found_in_the_states_of_a_simulator_where_nothing_is_
     assert report.effects[0].effect.values == pytest.approx([-0.5], abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "planted",
     [

@@ -66,6 +66,7 @@ def test_a_smoothed_start_is_less_certain_where_a_velocity_jumps(jump: float, lo
     assert low <= misfit(episode, 20, np.full(2, 1e-3))[0] <= high
 
 
+@pytest.mark.slow
 def test_a_complete_model_that_hops_is_complete() -> None:
     report = trace(LEG, hops(runs=6), ["knee.damping"], candidates=["coulomb_friction"], seed=0)
     (finding,) = (f for f in report.findings if f.kind == "contacts")

@@ -32,6 +32,7 @@ def traced(integrator: str) -> Report:
     return trace(LIFT.format(integrator), data, ["z.damping"], candidates=kinds, threads=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("integrator", "astray"), [("Euler", True), ("RK4", False)])
 def test_the_load_is_found_though_a_damping_could_freeze_the_lift(integrator: str, astray: bool) -> None:
     report = traced(integrator)

@@ -56,6 +56,7 @@ class Reader(HTMLParser):
             self.cells[-1] += data
 
 
+@pytest.mark.slow
 def test_known_noise_is_listed_of_velocities_too(report: Report) -> None:
     joints = report.data.columns.qvel
     assert f"{joints[0]}, velocity" not in Reader(render(report)).cells

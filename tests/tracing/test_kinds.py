@@ -59,6 +59,7 @@ def test_the_simplest_kind_that_meets_exact_data_is_taken(planted: Effect, found
     assert model.fit.values[s.simulation.slices[found]] == pytest.approx(planted.values, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_two_kinds_meet_what_neither_does_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     s = selector([CoulombFriction("hinge", level=0.08), TorqueOffset("hinge", offset=0.1)])
     model = few(s)

@@ -195,6 +195,7 @@ def test_the_noise_of_a_free_body_is_that_of_its_turns() -> None:
 # --- what is left is noise, or is not ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [3e-3, 3e-2, 0.3])
 def test_a_true_model_is_adequate_whatever_the_noise_of_the_speeds(speed: float) -> None:
     noise, found = Noise(np.array([1e-3]), np.array([speed])), []

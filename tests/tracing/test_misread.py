@@ -66,6 +66,7 @@ EXCHANGED = {"qpos.shoulder": "qpos.elbow", "qpos.elbow": "qpos.shoulder"}
 TOLD = {"ctrl.first": "ctrl.second", "ctrl.second": "ctrl.first"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("late", "names", "signs", "said"),
     [

@@ -42,6 +42,7 @@ def test_what_is_missing_is_not_taken_for_steps() -> None:
     assert origin(compiled(OWN), data, DECLARED, np.array([1e-3]), 0.4, 1) == "machine"
 
 
+@pytest.mark.slow
 def test_own_steps_are_recognised_once_what_is_missing_is_found() -> None:
     """At first a large friction hides how the steps err; found, it is out of the way, and the search begins anew."""
     data = recorded([CoulombFriction("hinge", level=0.3)], compiled(OWN), noise=1e-3)
@@ -86,6 +87,7 @@ def test_a_simulator_that_was_logged_as_slowly_as_it_is_commanded_is_exact(offse
     assert ["searched again" in f.message for f in report.findings if f.kind == "simulated"] == [True]
 
 
+@pytest.mark.slow
 def test_a_machine_that_was_logged_slowly_and_lacks_what_is_not_looked_for_is_none() -> None:
     fine = compiled(OWN.replace('timestep="0.005"', 'timestep="0.001" integrator="RK4"'))
     data = recorded([CoulombFriction("hinge", level=0.2)], fine, rate=40)

@@ -52,6 +52,7 @@ def findings(report) -> set[str]:
     return {f.kind for f in report.findings}
 
 
+@pytest.mark.slow
 def test_of_joints_that_a_constraint_ties_no_missing_force_is_told(tmp_path) -> None:
     tied = machine(MOTOR).replace(
         "</worldbody>",
@@ -82,6 +83,7 @@ def test_of_joints_that_a_constraint_ties_no_missing_force_is_told(tmp_path) -> 
     assert "an equality constraint transmits" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_filters_time_constant_is_declared_and_found() -> None:
     slow = '<general name="motor" joint="hinge" dyntype="filter" dynprm="{}"/>'
     data = steps(machine(slow.format(0.09)))
@@ -96,6 +98,7 @@ def test_a_machine_without_actuators_is_complete() -> None:
     assert report.declared[0].effect.values[0] == pytest.approx(0.05, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dynamics", ["filter", "filterexact"])
 def test_an_actuators_own_filter_is_led_through_the_commands_before_a_window(dynamics: str) -> None:
     xml = machine(f'<general name="motor" joint="hinge" dyntype="{dynamics}" dynprm="0.1" gainprm="1"/>')
@@ -105,6 +108,7 @@ def test_an_actuators_own_filter_is_led_through_the_commands_before_a_window(dyn
     assert missing < 0.1 * load
 
 
+@pytest.mark.slow
 def test_an_actuators_own_delay_is_led_too() -> None:
     xml = machine('<motor name="motor" joint="hinge" delay="0.04" nsample="402"/>')
     data = steps(xml)
@@ -192,6 +196,7 @@ def test_a_number_that_is_both_a_column_and_declared_is_refused() -> None:
         trace(machine(MOTOR), data, ["pole.mass"], threads=1)
 
 
+@pytest.mark.slow
 def test_a_select_run_shorter_than_a_window_joins_the_training_runs() -> None:
     data = steps(machine(MOTOR), 6, 600)
     parts = ["train", "train", "train", "train", "select", "test"]

@@ -44,6 +44,7 @@ def look_forward() -> Model:
     return selector.look_forward(Selection(base), [limit]).model
 
 
+@pytest.mark.slow
 def test_a_limit_that_few_commands_reach_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     damping, mass, inverse = look_forward().fit.values
     assert 1 / inverse == pytest.approx(LIMIT, rel=0.02)

@@ -37,6 +37,7 @@ def traced(offset: float) -> Report:
     return trace(ARM, data, ["hinge.damping", "servo.kp"], candidates=kinds, threads=1)
 
 
+@pytest.mark.slow
 def test_the_zero_is_found_and_not_what_it_resembles() -> None:
     report = traced(OFFSET)
     assert report.verdict == "explained"

@@ -36,6 +36,7 @@ def traced(seed: int) -> Report:
     return trace(BALL, data, ["tube.damping"], candidates=["armature", "torque_offset", "quadratic_drag"], threads=1)
 
 
+@pytest.mark.slow
 def test_what_shows_in_a_third_of_the_windows_is_found() -> None:
     report = traced(0)  # in which a fit that gives up the fast throws meets all others
     assert report.adequacy_before.ratio < 1.1
@@ -45,6 +46,7 @@ def test_what_shows_in_a_third_of_the_windows_is_found() -> None:
     assert labels in ({"armature(tube)", "quadratic_drag(tube)"}, {"torque_offset(tube)", "quadratic_drag(tube)"})
 
 
+@pytest.mark.slow
 def test_what_would_do_as_well_is_given_with_its_values_and_what_goes_with_them(tmp_path: Path) -> None:
     report = traced(1)
     assert report.verdict == "explained"

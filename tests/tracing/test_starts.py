@@ -151,6 +151,7 @@ BALL = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocities", [True, False])
 def test_a_complete_machine_with_a_ball_joint_is_complete(velocities: bool) -> None:
     data = recorded(BALL, 4, velocities=velocities)
@@ -168,6 +169,7 @@ SERVO = """
 """
 
 
+@pytest.mark.slow
 def test_a_stiff_servo_that_steps_is_complete_from_slow_positions() -> None:
     model, resolution = mujoco.MjModel.from_xml_string(SERVO.replace('mass=".6"', 'mass=".75"')), 2 * np.pi / 4096
     rng, tables = np.random.default_rng(0), {}

@@ -41,6 +41,7 @@ def rubbing() -> Measurements:
     return crank(HARD)
 
 
+@pytest.mark.slow
 def test_dry_friction_is_judged_with_steps_that_meet_its_kinks(rubbing: Measurements) -> None:
     model = CRANK.format(friction="")
     report = trace(model, rubbing, ["crank.damping"], candidates=["coulomb_friction"], threads=1)
@@ -50,6 +51,7 @@ def test_dry_friction_is_judged_with_steps_that_meet_its_kinks(rubbing: Measurem
     assert [f.where for f in report.findings if f.kind == "time step"] == ["model"]
 
 
+@pytest.mark.slow
 def test_a_rubbing_machine_whose_friction_is_declared_is_complete(rubbing: Measurements) -> None:
     model = CRANK.format(friction='frictionloss="0.1" solreffriction="0.001 1" solimpfriction="0.99 0.99"')
     declared = ["crank.damping", "crank.frictionloss"]
@@ -94,6 +96,7 @@ def test_finer_steps_are_not_taken_where_the_model_is_adequate(monkeypatch: pyte
     assert report.verdict == "complete"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("late", "friction", "said"), [(1, "", ["all episodes, ctrl"]), (0, HARD, [])])
 def test_commands_logged_after_they_acted_are_found(late: int, friction: str, said: list[str]) -> None:
     model = CRANK.format(friction="")

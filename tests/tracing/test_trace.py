@@ -205,6 +205,7 @@ def test_an_effect_that_is_not_among_the_candidates_is_not_explained() -> None:
     assert [c.label for c in report.candidates] == ["torque_offset(hinge)"]
 
 
+@pytest.mark.slow
 def test_where_much_is_left_to_explain_longer_windows_are_looked_at() -> None:
     there = [CoulombFriction("hinge", level=0.25), TorqueOffset("hinge", offset=0.1)]
     data, friction = recorded(there, compiled(COARSE), 9, 3.2, rate=50), ["coulomb_friction"]

@@ -42,6 +42,7 @@ def differences(report: Report, scale: float) -> np.ndarray:
     return report.zeros.offsets[:, 0] - scale * ZEROS[[int(run) for run in report.zeros.runs]]
 
 
+@pytest.mark.slow
 def test_zeros_of_single_runs_are_found_and_taken_off() -> None:
     report = traced(0.0, 1.0)
     assert report.verdict == "explained"
@@ -52,6 +53,7 @@ def test_zeros_of_single_runs_are_found_and_taken_off() -> None:
     assert set(report.zeros.runs) == {*report.runs["train"], *report.runs["select"]}
 
 
+@pytest.mark.slow
 def test_an_effect_beside_them_is_named() -> None:
     report = traced(0.5, 1.0)
     assert [t.label for t in report.effects] == ["spring(hinge)"]
@@ -59,6 +61,7 @@ def test_an_effect_beside_them_is_named() -> None:
     np.testing.assert_allclose(differences(report, 1.0), 0.0, atol=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [0.0, 0.5])
 def test_one_zero_in_all_runs_is_none_that_differs(stiffness: float) -> None:
     report = traced(stiffness, 0.0, 0.0 if stiffness else 0.05)
@@ -66,6 +69,7 @@ def test_one_zero_in_all_runs_is_none_that_differs(stiffness: float) -> None:
     assert [t.label for t in report.effects] == [f"{'spring' if stiffness else 'sensor_bias'}(hinge)"]
 
 
+@pytest.mark.slow
 def test_what_all_runs_have_beyond_chance_is_a_bias_of_the_sensor() -> None:
     report = traced(0.0, 0.3, 0.2)
     (bias,) = report.effects
@@ -117,6 +121,7 @@ def test_every_run_is_told_its_zero_and_one_without_a_window_is_named(monkeypatc
         report.zeros_of(replace(new, episodes=[*new.episodes[:-1], short]))
 
 
+@pytest.mark.slow
 def test_of_a_run_that_is_too_short_for_a_window_no_zero_is_said() -> None:
     data = shifted(runs(), ZEROS)
     short = data.episodes[-1].part_of(slice(40), after_gap=False)
