@@ -119,9 +119,8 @@ class PhysicalDynamics(Dynamics):
     def _adopt(self, effects: Sequence[Effect], deviations: Mapping[str, np.ndarray] | None = None) -> None:
         """Let phi be the values of these effects, with deviations by their labels, 0 where none is told."""
         self.simulation = Simulation(self.model, effects, self.threads)
-        gears = np.abs(self.model.actuator_gear[:, 0]) * np.max(
-            np.abs(self.model.actuator_ctrlrange), axis=1, initial=0
-        )
+        largest = np.abs(self.model.actuator_ctrlrange).max(axis=1, initial=0)[self.model.actuator_ctrladr]
+        gears = np.abs(self.model.actuator_gear[:, 0]) * largest
         strongest = float(gears.max(initial=0.0))
         scales = Scales(torque=strongest if strongest > 0 else 1.0)
         parameters = [p for e in self.simulation.effects for p in e.parameters]

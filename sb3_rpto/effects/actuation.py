@@ -11,13 +11,14 @@ from sb3_rpto.effects.world import World
 #: which does.
 LAGS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 FILTERS = (*LAGS, int(mujoco.mjtDyn.mjDYN_MUSCLE))
-_GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
-_BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
-_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+# Plain numbers: NumPy's integers are not found among MuJoCo's enumerators.
+GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
+BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
+JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 def command_limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest and largest command of each actuator, in its unit, (nu,) each; infinite where it is not limited."""
+    """Smallest and largest of each command, in its unit, (nu,) each; infinite where it is not limited."""
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = np.where(limited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf)).T
     return low, high
@@ -26,11 +27,11 @@ def command_limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 def memoryless(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether an actuator's force follows from its command and its joint alone: no activation, delay or tendon."""
     return bool(
-        model.actuator_trntype[actuator] in _JOINT
+        model.actuator_trntype[actuator] in JOINTS
         and model.actuator_ctrlnum[actuator] == 1
         and model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
-        and model.actuator_gaintype[actuator] in _GAINS
-        and model.actuator_biastype[actuator] in _BIASES
+        and model.actuator_gaintype[actuator] in GAINS
+        and model.actuator_biastype[actuator] in BIASES
         and not np.any(model.actuator_delay[actuator])
     )
 
@@ -38,7 +39,7 @@ def memoryless(model: mujoco.MjModel, actuator: int) -> bool:
 def drivers(model: mujoco.MjModel, joint: int) -> list[int]:
     """The actuators that act on a joint itself, not through a tendon or a site."""
     actuators = range(model.nactuator)
-    return [a for a in actuators if model.actuator_trntype[a] in _JOINT and model.actuator_trnid[a, 0] == joint]
+    return [a for a in actuators if model.actuator_trntype[a] in JOINTS and model.actuator_trnid[a, 0] == joint]
 
 
 def motors(model: mujoco.MjModel, joint: int) -> list[int] | None:
@@ -51,7 +52,7 @@ def motors(model: mujoco.MjModel, joint: int) -> list[int] | None:
 
 def _moves_otherwise(model: mujoco.MjModel, actuator: int, joint: int) -> bool:
     """Whether an actuator may move a joint by other ways than as its own: a tendon, a site, a body."""
-    if model.actuator_trntype[actuator] in _JOINT:
+    if model.actuator_trntype[actuator] in JOINTS:
         return False
     if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_TENDON:
         return True
@@ -91,9 +92,10 @@ def motor_torque(world: World, actuator: int, dof: int, adr: int) -> np.ndarray:
         return np.zeros(world.n)
     gear = world.field("actuator_gear")[:, actuator, 0]
     length, speed = gear * world.qpos[:, adr], gear * world.qvel[:, dof]
-    u = world.ctrl[:, model.actuator_ctrladr[actuator]]
-    if model.actuator_ctrllimited[actuator] and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
-        limits = world.field("actuator_ctrlrange")[:, actuator]
+    ctrl = int(model.actuator_ctrladr[actuator])
+    u = world.ctrl[:, ctrl]
+    if model.actuator_ctrllimited[ctrl] and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+        limits = world.field("actuator_ctrlrange")[:, ctrl]
         u = np.clip(u, limits[:, 0], limits[:, 1])
     gain = world.field("actuator_gainprm")[:, actuator]
     affine = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_AFFINE

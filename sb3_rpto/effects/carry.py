@@ -61,15 +61,17 @@ class Corrected:
 
         :param env: a gymnasium MuJoCo environment; it is changed. :func:`sb3_rpto.envs.corrected.apply_effects` with
             :attr:`effects` leaves it alone
-        :raises TypeError: ``env`` is none
+        :raises TypeError: ``env`` is no environment
+        :raises ValueError: it is none of MuJoCo's
         """
         if not isinstance(env, gym.Env):
             raise TypeError(
                 f"env must be a gymnasium MuJoCo environment, not {type(env).__name__}; without one, "
                 "simulation().rollout(...) simulates the corrected model"
             )
-        effects, given = self.effects, env.unwrapped.model  # type: ignore[attr-defined]
-        if same_layout(given, self.model) and not differing(given, self.model, rounded=True):
+        effects, given = self.effects, getattr(env.unwrapped, "model", None)
+        mine = isinstance(given, mujoco.MjModel) and same_layout(given, self.model)
+        if mine and not differing(given, self.model, rounded=True):
             return StandingEnv(env, [e for e in effects if carried_by(e) == "wrapper"], self.heights)
         return StandingEnv(env, effects)
 

@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.actuation import GAINS
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.world import World
@@ -114,10 +115,8 @@ class CommandGain(Effect):
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
         """Actuators whose force is linear in their gain parameters."""
-        # Plain numbers: NumPy's integers are not found among MuJoCo's enumerators.
-        linear = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
         gains = dict(zip(object_names(model, "actuator"), model.actuator_gaintype))
-        return [name for name in super().places(model) if gains[name] in linear]
+        return [name for name in super().places(model) if gains[name] in GAINS]
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Scale the gain."""

@@ -37,7 +37,7 @@ def load_model(source: ModelSource) -> tuple[mujoco.MjSpec | None, mujoco.MjMode
         return None, copy.copy(source)
     if isinstance(source, tuple):
         known, model = source
-        return known.copy(), copy.copy(model)
+        return None if known is None else known.copy(), copy.copy(model)
     if isinstance(source, mujoco.MjSpec):
         spec = source.copy()
         return spec, spec.compile()

@@ -15,12 +15,19 @@ SCALAR_JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLI
 
 
 def object_names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Names by id; a nameless object is called by its kind and id (``joint0``).
+    """Names by id; a nameless object is called by its kind and id (``joint0``, or ``joint0_`` if another has it).
 
     :param kind: ``"joint"``, ``"body"``, ``"geom"`` or ``"actuator"``
     """
     objtype, count = _KINDS[kind]
-    return [mujoco.mj_id2name(model, objtype, i) or f"{kind}{i}" for i in range(getattr(model, count))]
+    names = [mujoco.mj_id2name(model, objtype, i) or "" for i in range(getattr(model, count))]
+    taken = set(names)
+    for i, name in enumerate(names):
+        if not name:
+            names[i] = f"{kind}{i}"
+            while names[i] in taken:
+                names[i] += "_"
+    return names
 
 
 def object_id(model: mujoco.MjModel, kind: str, name: str) -> int:

@@ -8,13 +8,14 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.actuation import LAGS
+from sb3_rpto.effects.actuation import BIASES, GAINS, LAGS
 from sb3_rpto.effects.effect import Scales
 from sb3_rpto.effects.length import held_by_constraint, link_length, write_length
 from sb3_rpto.effects.world import World
 
 #: Dry friction in N·m or N that is left of a model's own.
 LEAST_FRICTION = 1e-12
+_PID = int(mujoco.mjtGain.mjGAIN_PID)
 
 
 class Number(NamedTuple):
@@ -113,6 +114,21 @@ def _read_timeconst(model: mujoco.MjModel, actuator: int) -> float:
     return float(model.actuator_dynprm[actuator, 0])
 
 
+def _read_gain(model: mujoco.MjModel, actuator: int) -> float:
+    _read_strength(model, actuator)
+    if model.actuator_gaintype[actuator] not in GAINS:
+        raise ValueError("the actuator's gain is no factor on its command; declare its strength or gear")
+    return float(model.actuator_gainprm[actuator, 0])
+
+
+def _read_strength(model: mujoco.MjModel, actuator: int) -> float:
+    """A factor, 1 in the model as it is."""
+    linear = model.actuator_gaintype[actuator] in (*GAINS, _PID) and model.actuator_biastype[actuator] in BIASES
+    if not linear:
+        raise ValueError("the actuator's force is not linear in its parameters; declare its gear")
+    return 1.0
+
+
 def _write_strength(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
     for name in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"):
         world.field(name)[:, actuator] *= values[:, None]
@@ -148,10 +164,6 @@ def _write_range(world: World, joint: int, values: np.ndarray, nominal: float) -
     limits[:] = pivot + (limits - pivot) * (values / nominal)[:, None]
 
 
-def _one(model: mujoco.MjModel, index: int) -> float:
-    return 1.0
-
-
 def _friction_size(scales: Scales) -> float:
     return 0.05 * scales.torque
 
@@ -178,11 +190,11 @@ NUMBERS: dict[str, dict[str, Number]] = {
     "geom": {"friction": Number("", *_column("geom_friction", 0), lambda s: 0.1)},
     "actuator": {
         "gear": Number("", _read_gear, _write_gear, lambda s: 1.0, _POSITIVE),
-        "gain": Number("", *_column("actuator_gainprm", 0), lambda s: 1.0, _POSITIVE),
+        "gain": Number("", _read_gain, _column("actuator_gainprm", 0)[1], lambda s: 1.0, _POSITIVE),
         "kp": Number("N·m/rad", _read_kp, _write_kp, lambda s: 1.0, _POSITIVE),
         "kv": Number("N·m·s/rad", _read_kv, _write_kv, _viscous_size),
         "timeconst": Number("s", _read_timeconst, _column("actuator_dynprm", 0)[1], lambda s: 0.01, _POSITIVE),
-        "strength": Number("", _one, _write_strength, lambda s: 1.0, _POSITIVE),
+        "strength": Number("", _read_strength, _write_strength, lambda s: 1.0, _POSITIVE),
         "damping": Number("N·m·s/rad", *_column("actuator_damping"), _viscous_size),
     },
 }

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.actuation import JOINTS
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.world import World
 
@@ -16,7 +17,7 @@ def _along(x: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 def readers(sensor: Effect, model: mujoco.MjModel) -> np.ndarray:
     """The actuators that feed back the sensor's position, kp (u - q) for one, with gear g kp (u - g q)."""
-    there = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == sensor.index)
+    there = np.isin(model.actuator_trntype, JOINTS) & (model.actuator_trnid[:, 0] == sensor.index)
     feedback = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (model.actuator_biasprm[:, 1] != 0)
     return np.flatnonzero(there & feedback)
 

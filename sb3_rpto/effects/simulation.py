@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -49,7 +50,7 @@ class Simulation:
     are transformed before.
 
     :param model: the nominal model; a copy is kept
-    :param effects: all that may act, declared parameters among them
+    :param effects: all that may act, declared parameters among them; copies are kept
     :param nthread: threads of the batch; 0: as many as there are cores
     """
 
@@ -57,7 +58,7 @@ class Simulation:
         self.model = lean(model)
         # A simulation that blows up must show, not start anew.
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        self.effects = list(effects)
+        self.effects = [copy.copy(effect) for effect in effects]  # bound to this model, which may be another one's
         self.nthread = nthread
         for effect in self.effects:
             effect.bind(self.model)
@@ -320,7 +321,7 @@ def settled(model: mujoco.MjModel, ctrl: np.ndarray) -> np.ndarray:
     """
     act, sent = np.zeros((len(ctrl), model.na)), np.clip(ctrl, *command_limits(model))
     for i in np.flatnonzero(np.isin(model.actuator_dyntype, FILTERS)):
-        act[:, model.actuator_actadr[i]] = sent[:, i]
+        act[:, model.actuator_actadr[i]] = sent[:, model.actuator_ctrladr[i]]
     return act
 
 

@@ -13,6 +13,7 @@ from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.wrapper import CorrectedEnv
 
 _FAR = 1e3  # m, farther than any robot's feet
+_UPRIGHT = 0.5  # of a floor's normal, its vertical part
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -109,14 +110,16 @@ def _address(model: mujoco.MjModel, joint: int) -> int:
 
 
 def _heights(model: mujoco.MjModel, joint: int, qpos: np.ndarray) -> tuple[float, float] | None:
-    """Of the lowest point over the floor, and of the body's origin over that point, m; None without a floor."""
-    static = model.body_weldid[model.geom_bodyid] == 0
-    floors = np.flatnonzero(static & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE))
-    if not len(floors) or static.all():
-        return None
+    """Of its lowest point over the floor, and of the body's origin over that point, m; None without a floor."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
+    static = model.body_weldid[model.geom_bodyid] == 0
+    upright = data.geom_xmat[:, 8] > _UPRIGHT  # a wall is no floor
+    floors = np.flatnonzero(static & upright & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE))
+    own = np.flatnonzero(model.body_rootid[model.geom_bodyid] == model.jnt_bodyid[joint])
+    if not len(floors) or not len(own):
+        return None
     floor = int(floors[0])
-    gap = min(mujoco.mj_geomDistance(model, data, floor, int(g), _FAR, None) for g in np.flatnonzero(~static))
+    gap = min(mujoco.mj_geomDistance(model, data, floor, int(g), _FAR, None) for g in own)
     return gap, float(data.xpos[model.jnt_bodyid[joint], 2] - data.geom_xpos[floor, 2]) - gap

@@ -84,7 +84,7 @@ class World(ABC):
         :param where: in which simulations, (n,)
         """
         self.field("dof_frictionloss")
-        if self.model.dof_frictionloss[dof] == 0:
+        if self._nominal["dof_frictionloss"][0, dof] == 0:
             self.field("dof_solref")[where, dof] = (2 * self.model.opt.timestep, 1.0)
             self.field("dof_solimp")[where, dof] = (0.99, 0.99, 0.001, 0.5, 2.0)
 
@@ -132,7 +132,8 @@ class BatchWorld(World):
         for name in few._nominal:
             self.field(name)[:] = few._live(name)[kind]
         for name in mujoco.MjModel._setconst_outputs:
-            if few.batch.expanded(name) is not None:
+            # Of both: what followed here from the numbers of a rollout before must go, too.
+            if any(world.batch.expanded(name) is not None for world in (few, self)):
                 self._live(name)[:] = few._live(name)[kind]
         self._keep_friction()
 

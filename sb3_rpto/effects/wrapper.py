@@ -14,7 +14,7 @@ from gymnasium.utils import EzPickle, RecordConstructorArgs
 
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
-from sb3_rpto.effects.sensors import ago
+from sb3_rpto.effects.sensors import SensorGain, ago, readers
 from sb3_rpto.effects.simulation import Active, prepare, push, pushing
 from sb3_rpto.effects.world import LiveWorld
 
@@ -103,7 +103,8 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
 
         :param effects: with their values, those of declared parameters too: what is not among them is nominal again
         :raises ValueError: an effect on an object that is not in the model, or on sensors that are read elsewhere than
-            in ``_get_obs``, or other effects came on top of these; nothing is changed then
+            in ``_get_obs``; a gain of a sensor that a servo reads and effects beneath change, or the other way round;
+            other effects came on top of these; nothing is changed then
         """
         if self._covered:
             raise ValueError("other effects came on top of these; set those, or begin from an environment without")
@@ -118,6 +119,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
                 raise ValueError(
                     f"{', '.join(sensing)}: {type(base).__name__} has no _get_obs(); read its sensors there"
                 )
+            self._require_whole_servos(mine)
         except Exception:
             prepare(self._world, active(self.effects))
             raise
@@ -138,6 +140,19 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             if wanted:
                 setattr(base, seam, answer)
                 self._wanted.add(seam)
+
+    def _require_whole_servos(self, effects: Sequence[Effect]) -> None:
+        """What a servo feeds back of its sensor is written once, with all that the sensor does."""
+        model = self._world.model
+        beneath = [effect for layer in corrections(self)[1:] for effect, _ in layer._sensing]
+        for effect, _ in active(effects):
+            fed_back = effect.senses and effect.overrides("write") and readers(effect, model).size
+            others = [x for x in beneath if x.on == effect.on and x.overrides("write")] if fed_back else []
+            if any(isinstance(x, SensorGain) for other in others for x in (effect, other)):
+                raise ValueError(
+                    f"{effect.label}: a servo regulates what this sensor shows, and {others[0].label} beneath changes "
+                    "that already; put both into one list of effects"
+                )
 
     @property
     def alters_observations(self) -> bool:

@@ -15,6 +15,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto.algorithms.closing import horizon_of
 from sb3_rpto.effects import LIBRARY, Effect
+from sb3_rpto.effects.names import object_names
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments.closed_loop import moved, peak_force
 from sb3_rpto.experiments.first_trace import GUSTS, Gusts, judged
@@ -78,7 +79,7 @@ def make_target(job: Job) -> tuple[gym.Env, list[Effect]]:
             effect = LIBRARY[job.kind](model.joint(joint).name)
             value = size * peak_force(model, joint) / (speed**2 or 1.0)
         else:
-            effect = LIBRARY[job.kind](model.actuator(motor).name or f"actuator{motor}")
+            effect = LIBRARY[job.kind](object_names(model, "actuator")[motor])
             value = size * robot.dt if job.kind == "command_delay" else 1 - size
         effect.bind(model)
         effects.append(effect.with_values(np.array([value])))

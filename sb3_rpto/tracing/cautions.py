@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import replace
 
 import mujoco
@@ -174,7 +173,7 @@ def creeping(problem: Problem, values: np.ndarray, named: Sequence[int]) -> tupl
     model = simulation.model.__copy__()
     # A joint that has some keeps its own constraint, see World.rough.
     model.dof_frictionloss[[e.dof for e in firm]] = LITTLE
-    soft = Simulation(model, [copy(e) for e in simulation.effects], simulation.nthread)
+    soft = Simulation(model, simulation.effects, simulation.nthread)
     fit = Problem(soft, problem.windows, problem.scales).fit(values, free, iterations=SOFT_FIT)
     return firm, float(np.median(fit.errors) / np.median(problem.score(values).errors))
 
@@ -243,7 +242,7 @@ def finer_steps(
     own = problem.simulation
     model = own.model.__copy__()
     model.opt.timestep /= SHORTER
-    finer = Simulation(model, [copy(e) for e in own.effects], own.nthread)
+    finer = Simulation(model, own.effects, own.nthread)
     windows = cut(model, data, noise_levels(data), horizon, STEPPED)
     fit = Problem(finer, windows, problem.scales).fit(values, free, iterations=SOFT_FIT)
     finer_error, error = float(np.median(fit.errors)), float(np.median(problem.score(values).errors))

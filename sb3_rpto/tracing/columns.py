@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from sb3_rpto.effects.names import object_names
+
 if TYPE_CHECKING:
     import mujoco
 
@@ -55,13 +57,12 @@ def columns_of(model: mujoco.MjModel) -> Columns:
     """
     qpos: list[str] = []
     qvel: list[str] = []
-    for j in range(model.njnt):
-        name, size = model.joint(j).name or f"joint{j}", len(model.joint(j).qpos0)
+    for j, name in enumerate(object_names(model, "joint")):
+        size = len(model.joint(j).qpos0)
         for names, count in ((qpos, size), (qvel, {7: 6, 4: 3, 1: 1}[size])):
             names += [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
     ctrl: list[str] = []
-    for a, count in enumerate(model.actuator_ctrlnum):
-        name = model.actuator(a).name or f"actuator{a}"
+    for name, count in zip(object_names(model, "actuator"), model.actuator_ctrlnum, strict=True):
         ctrl += [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
     return Columns(tuple(qpos), tuple(qvel), tuple(ctrl), (), (), ())
 

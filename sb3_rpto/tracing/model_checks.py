@@ -104,8 +104,8 @@ def check_names(model: mujoco.MjModel, data: Measurements) -> None:
 
 def _check_actuators(model: mujoco.MjModel) -> None:
     """Refuse actuators whose own state at a window's start is in no column."""
-    for i, count in enumerate(model.actuator_ctrlnum):
-        name, dynamics = model.actuator(i).name or f"actuator{i}", int(model.actuator_dyntype[i])
+    for i, name in enumerate(object_names(model, "actuator")):
+        count, dynamics = model.actuator_ctrlnum[i], int(model.actuator_dyntype[i])
         if count != 1:
             raise ValueError(f"actuator {name!r} takes {count} commands; traced are those of one, such as <position>")
         if dynamics not in _KNOWN_DYNAMICS:

@@ -107,7 +107,18 @@ class Pushed(InvertedPendulumEnv):
         return super().step(action)
 
 
-@pytest.mark.parametrize(("made_by", "message"), [(Scaled, "gives the commands"), (Pushed, "moves otherwise")])
+class Leaning(InvertedPendulumEnv):
+    """What its reset sets stays, and is in no position or velocity."""
+
+    def reset_model(self) -> Any:
+        self.data.xfrc_applied[2, 0] = 3.0
+        return super().reset_model()
+
+
+@pytest.mark.parametrize(
+    ("made_by", "message"),
+    [(Scaled, "gives the commands"), (Pushed, "moves otherwise"), (Leaning, "moves otherwise")],
+)
 def test_a_step_that_is_more_than_its_simulation_is_refused(made_by: type[gym.Env], message: str) -> None:
     with pytest.raises(ValueError, match=rf"step\(\) {message}.*phi would make up for"):
         simulated(gym.wrappers.TimeLimit(made_by(), 1_000))

@@ -7,12 +7,14 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco import MujocoEnv
 
 from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales, Simulation, declare, mjcf, register
 from sb3_rpto.effects.bodies import LinkLength
 from sb3_rpto.effects.carry import carried_by, correct, load_corrected, save_corrected
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
 from sb3_rpto.effects.model import load_model, numbers
+from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.corrected import apply_effects
 
@@ -261,6 +263,32 @@ def test_a_walker_that_is_loaded_stands_as_the_one_that_was_saved(tmp_path):
                 np.testing.assert_allclose(mine, theirs, atol=1e-4)  # the file has six digits
 
 
+WORLD = """<mujoco><worldbody>{wall}
+  <geom name="floor" type="plane" size="5 5 .1"/>
+  <body name="arm" pos="0 0 .5"><joint name="h"/><geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02"/></body>
+  <body name="box" pos="1 0 .2"><freejoint/><geom type="box" size=".1 .1 .1"/>
+    <body name="foot" pos=".1 0 0"><joint name="ankle"/><geom type="capsule" fromto="0 0 0 0 0 -.15" size=".02"/></body>
+  </body></worldbody><actuator><motor joint="h"/></actuator></mujoco>"""
+WALL = '<geom name="wall" type="plane" pos="3 0 0" zaxis="-1 0 0" size="5 5 .1"/>'
+
+
+class Standing(MujocoEnv):
+    metadata = MujocoEnv.metadata | {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}
+
+    def __init__(self, xml):
+        super().__init__(xml, 4, gym.spaces.Box(-np.inf, np.inf, (1,)))
+
+
+@pytest.mark.parametrize("wall", ["", WALL])
+def test_what_stands_does_so_by_its_own_lowest_point_over_the_floor(wall, tmp_path):
+    (tmp_path / "world.xml").write_text(WORLD.format(wall=wall))
+    heights = []
+    for effects in ([], [LinkLength("arm", change=0.5)], [LinkLength("foot", change=0.2)]):
+        env = StandingEnv(Standing(str(tmp_path / "world.xml")), effects)
+        heights.append(env.unwrapped.init_qpos[3])
+    assert heights == pytest.approx([0.2, 0.2, 0.2 + 0.2 * 0.15])
+
+
 def test_a_walker_that_begins_in_a_pose_of_its_own_is_left_there(tmp_path):
     from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 
@@ -439,6 +467,7 @@ def test_models_load_from_every_source(tmp_path):
     assert found is None
     assert model is not compiled
     assert_equal_models(model, compiled)
+    assert load_model((found, model))[0] is None, "as the pair that it returned"
     env = gym.make("Hopper-v5")
     env.unwrapped.model.dof_damping[3] = 0.125
     found, model = load_model(env)
@@ -456,6 +485,12 @@ def test_an_environment_that_was_corrected_meanwhile_is_saved_as_it_was(tmp_path
     save_corrected(tmp_path / "second", pair, lacks)
     for name in ("model.xml", "effects.json"):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
+
+
+def test_an_environment_without_mujoco_takes_no_correction(tmp_path):
+    save_corrected(tmp_path, gym.make(POLE), [])
+    with pytest.raises(ValueError, match="PendulumEnv is no gymnasium MuJoCo environment"):
+        load_corrected(tmp_path).apply(gym.make("Pendulum-v1"))
 
 
 def test_bad_sources_are_named(tmp_path):

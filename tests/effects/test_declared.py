@@ -61,6 +61,36 @@ def test_a_servos_gains_are_those_of_servos() -> None:
         assert name not in parameter_names(MODEL)
 
 
+@pytest.mark.parametrize("actuator", ["muscle", 'dcmotor motorconst="0.05 0.05" resistance="1"'])
+def test_of_a_force_that_is_not_linear_there_is_no_factor(actuator: str) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="h" range="-1 1" limited="true"/><geom size=".1" mass="1"/></body>'
+        f'</worldbody><actuator><{actuator} name="m" joint="h"/></actuator></mujoco>'
+    )
+    for name in ("m.strength", "m.gain"):
+        assert name not in parameter_names(model)
+        with pytest.raises(ValueError, match=f"{name}: the actuator's force is not linear .* declare its gear"):
+            declare(model, [name])
+    assert "m.gear" in parameter_names(model)
+
+
+def test_a_regulators_strength_is_a_factor_on_its_force() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="h"/><geom size=".1" mass="1"/></body></worldbody>'
+        '<actuator><pid name="m" joint="h" kp="10"/></actuator></mujoco>'
+    )
+    forces = []
+    for strength in (1.0, 2.0):
+        data, (declared,) = mujoco.MjData(model), declare(model, ["m.strength"])
+        corrected = correct(model, [declared.with_values(np.array([strength]))])
+        data.ctrl[0] = 0.5
+        mujoco.mj_forward(corrected, data)
+        forces.append(data.actuator_force[0])
+    assert forces == [5.0, 10.0]
+    with pytest.raises(ValueError, match=r"m\.gain: .* no factor on its command; declare its strength"):
+        declare(model, ["m.gain"])
+
+
 def test_default_bounds() -> None:
     (damping,), (mass,), (length,) = (declare(MODEL, [n]) for n in ("hinge.damping", "arm.mass", "arm.length"))
     assert (damping.parameters[0].lower, damping.parameters[0].upper) == (0.0, np.inf)

@@ -2,13 +2,16 @@
 
 import copy
 import pickle
+from collections.abc import Sequence
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 
-from sb3_rpto.effects import LIBRARY, Drive, Effect, Simulation, candidates, parameter_names
+from sb3_rpto.effects import LIBRARY, Drive, Effect, Simulation, candidates, declare, parameter_names
+from sb3_rpto.effects.names import object_names
+from sb3_rpto.effects.simulation import settled
 from sb3_rpto.envs.corrected import apply_effects
 
 ARM = """
@@ -19,7 +22,9 @@ LINK = """<body pos="0 {y} 0"><joint name="{name}" axis="0 1 0" {joint}/>
   <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass="1"/></body>"""
 
 
-def arms(actuators: str, joints: str = "h", joint: str = "", dt: float = 0.002, option: str = "") -> mujoco.MjModel:
+def arms(
+    actuators: str, joints: Sequence[str] = "h", joint: str = "", dt: float = 0.002, option: str = ""
+) -> mujoco.MjModel:
     """Links side by side on hinges in the plane, without gravity."""
     bodies = "".join(LINK.format(y=y, name=name, joint=joint) for y, name in enumerate(joints))
     xml = ARM.format(dt=dt, bodies=bodies, last=joints[-1], actuators=actuators)
@@ -118,6 +123,36 @@ def test_a_command_is_the_actuators_own_where_another_takes_two() -> None:
     assert "m.gear" in parameter_names(model)
     with pytest.raises(ValueError, match="command_deadband cannot sit on actuator 'o': it can on m"):
         Simulation(model, [LIBRARY["command_deadband"]("o", width=0.1)], 1)
+
+
+def test_a_commands_limits_are_its_own_where_another_actuator_takes_two() -> None:
+    """Of three commands the last is the motor's, the second actuator."""
+    limited = '<motor name="m" joint="g" ctrlrange="-.5 .5" ctrllimited="true"/>'
+    weak = LIBRARY["dc_motor"]("m", inverse_stall=1.0)
+    for before, command in (("", [3.0]), ('<pid name="o" joint="h" kp="10"/>', [0.0, 0.0, 3.0])):
+        model = arms(before + limited, joints="gh")
+        assert speed(model, [weak], command) == speed(model, [], command) > 0.01, "at half its stall nothing is lost"
+
+
+def test_a_filter_settles_at_its_own_command_where_another_actuator_takes_two() -> None:
+    model = arms(TWO + '<general joint="g" dyntype="filter" dynprm="0.1"/>', joints="hg")
+    assert settled(model, np.array([[0.1, 0.2, 0.3, 0.4]])).tolist() == [[0.4]]
+
+
+def test_nameless_objects_never_take_the_name_of_another() -> None:
+    model = arms(ONE, joints=["joint1", "", "h"])  # an empty name is none
+    assert object_names(model, "joint") == ["joint1", "joint1_", "h"]
+    labels = [effect.label for effect in candidates(model)]
+    assert len(set(labels)) == len(labels)
+    assert [d.label for d in declare(model, ["joint*.damping"])] == ["joint1.damping", "joint1_.damping"]
+
+
+def test_a_servo_in_the_parent_regulates_what_its_sensor_shows_too() -> None:
+    bias = LIBRARY["sensor_bias"]("h", offset=0.2)
+    reached = [
+        speed(arms(f'<position {where}="h" kp="10"/>'), [bias], [0.3], 60) for where in ("joint", "jointinparent")
+    ]
+    assert reached[0] == reached[1] != speed(arms('<position joint="h" kp="10"/>'), [], [0.3], 60)
 
 
 MUSCLE = """<mujoco><worldbody><body><freejoint name="root"/><geom size=".1"/>

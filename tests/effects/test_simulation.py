@@ -149,6 +149,27 @@ def test_what_is_written_once_for_many_simulations_is_what_is_written_for_each()
         assert equal(alone, tuple(part[i : i + 1] for part in together))
 
 
+@pytest.mark.parametrize("n", [4, 32])
+def test_nothing_is_left_of_the_numbers_of_the_rollout_before(n: int) -> None:
+    """Each simulation with another length, then all with the model's own."""
+    effects = declare(MODEL, ["lower.length"])
+    sim = Simulation(MODEL, effects, 1)
+    qpos, qvel, commands = start(n, 60)
+    sim.rollout(sim.null * np.linspace(0.7, 1.3, n)[:, None], qpos, qvel, Drive(commands))
+    nominal = np.tile(sim.null, (n, 1))
+    fresh = Simulation(MODEL, effects, 1).rollout(nominal, qpos, qvel, Drive(commands))
+    assert equal(sim.rollout(nominal, qpos, qvel, Drive(commands)), fresh)
+
+
+def test_effects_of_one_simulation_may_be_anothers_too() -> None:
+    push = LIBRARY["torque_offset"]("elbow", offset=1.0)
+    sim, (qpos, qvel, commands) = Simulation(MODEL, [push], 1), start(2, 20)
+    before = sim.rollout(np.full((2, 1), 1.0), qpos, qvel, Drive(commands))
+    alone = '<mujoco><worldbody><body><joint name="elbow"/><geom size="1"/></body></worldbody></mujoco>'
+    Simulation(mujoco.MjModel.from_xml_string(alone), [push], 1)
+    assert equal(sim.rollout(np.full((2, 1), 1.0), qpos, qvel, Drive(commands)), before)
+
+
 @given(st.lists(st.integers(0, 3), min_size=1, max_size=12), st.lists(st.booleans(), min_size=12, max_size=12))
 def test_simulations_are_alike_where_all_their_parameters_are(levels: list[int], offsets: list[bool]) -> None:
     n, effect = len(levels), LIBRARY["torque_offset"]("elbow")

@@ -449,6 +449,18 @@ def test_sensors_and_commands_go_through_one_after_the_other():
     assert observation[1] == pytest.approx(np.sin(2 * (base.data.qpos[1] + 0.1)))
 
 
+def test_what_a_servo_feeds_back_of_its_sensor_is_of_one_list(tmp_path):
+    xml = Path(gym.make("InvertedPendulum-v5").unwrapped.fullpath).read_text()
+    (tmp_path / "servo.xml").write_text(xml.replace("<motor ", '<position kp="1" '))
+    env = gym.make("InvertedPendulum-v5", xml_file=str(tmp_path / "servo.xml"))
+    bias, gain = LIBRARY["sensor_bias"]("slider", offset=0.1), LIBRARY["sensor_gain"]("slider", change=0.2)
+    for beneath, top in ((bias, gain), (gain, bias)):
+        with pytest.raises(ValueError, match=rf"{top.kind}\(slider\): .*{beneath.kind}\(slider\) beneath .* one list"):
+            CorrectedEnv(CorrectedEnv(copy_env(env), [beneath]), [top])
+    CorrectedEnv(CorrectedEnv(copy_env(env), [bias]), [bias])
+    CorrectedEnv(CorrectedEnv(copy_env(env), [bias]), [LIBRARY["sensor_gain"]("hinge", change=0.2)])
+
+
 def test_a_late_sensor_shows_what_was_there_before():
     """0.026 s are two and three fifths of this task's substeps of 0.01 s, and half a step of the agent's."""
     env, bare = gym.make(POLE), gym.make(POLE)
@@ -618,6 +630,19 @@ def test_what_is_idle_stays_so_with_other_values_and_as_json():
     late.idle = True
     for made in (late.with_values(np.array([0.1])), late.as_known(), from_json(late.to_json()), copy.deepcopy(late)):
         assert made.idle
+
+
+@pytest.mark.parametrize("kinds", [("soft_friction", "coulomb_friction"), ("coulomb_friction", "soft_friction")])
+def test_friction_of_two_sorts_holds_in_any_order_in_the_environment_as_in_the_batch(kinds):
+    effects = [LIBRARY[kind]("slider", level=0.2) for kind in kinds]
+    env, sim = CorrectedEnv(gym.make(POLE), effects), Simulation(gym.make(POLE).unwrapped.model, effects, 1)
+    env.reset(seed=0)
+    base = env.unwrapped
+    start, command = (base.data.qpos.copy(), base.data.qvel.copy()), np.full((1, base.frame_skip, 1), 0.1)
+    env.step(np.array([0.1]))
+    qpos, qvel = sim.rollout(sim.values()[None], *(x[None] for x in start), Drive(command))
+    np.testing.assert_array_equal(qpos[0, -1], base.data.qpos)
+    np.testing.assert_array_equal(qvel[0, -1], base.data.qvel)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.4])
