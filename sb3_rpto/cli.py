@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 
 from sb3_rpto.commands import adapt, enjoy, plot, recordings, train, transfer
 from sb3_rpto.commands.options import check_file
+from sb3_rpto.commands.terminal import say
 from sb3_rpto.version import __version__
 
 #: Exit codes: bad input, and interrupted by the user.
@@ -145,7 +146,7 @@ def _add_trace(commands: Commands) -> None:
 
 
 def _trace(parsed: argparse.Namespace) -> int:
-    from sb3_rpto.effects.carry import overwrites, read_effects, save_corrected
+    from sb3_rpto.effects.carry import read_effects
     from sb3_rpto.effects.model import load_model
     from sb3_rpto.tracing import figures, trace
 
@@ -162,13 +163,7 @@ def _trace(parsed: argparse.Namespace) -> int:
     if parsed.out.exists() and not parsed.out.is_dir():
         raise ValueError(f"--out {parsed.out} is a file; give a folder")
     model = _model(parsed.model)
-    if overwrites(parsed.out, model):
-        raise ValueError(
-            f"--out {parsed.out} holds a model.xml that is MODEL, or that no trace wrote, and it would be overwritten; "
-            "give another folder"
-        )
-    with tempfile.TemporaryDirectory() as trial:
-        save_corrected(trial, model, [])
+    recordings.check_out(parsed.out, model)
     data = recordings.read(parsed.files, parsed.format)
     known = [] if parsed.known is None else read_effects(parsed.known, load_model(model)[1])
     with _folder(parsed.out), _progress(parsed.quiet) as progress:
@@ -187,11 +182,11 @@ def _trace(parsed: argparse.Namespace) -> int:
         )
     # Printed and written, whichever of the two fails.
     try:
-        _say(report.verdict if parsed.quiet else str(report))
+        say(report.verdict if parsed.quiet else str(report))
     finally:
         report.save(parsed.out)
     if not parsed.quiet:
-        _say(f"\nwritten: {parsed.out / 'report.html'}")
+        say(f"\nwritten: {parsed.out / 'report.html'}")
     return 0
 
 
@@ -208,12 +203,6 @@ def _folder(path: Path) -> Iterator[None]:
             with contextlib.suppress(OSError):
                 path.rmdir()
         raise
-
-
-def _say(text: str) -> None:
-    """Print, with question marks for what the terminal's encoding lacks: units and file names are not all ASCII."""
-    encoding = sys.stdout.encoding or "utf-8"
-    print(text.encode(encoding, errors="replace").decode(encoding), flush=True)
 
 
 def _model(name: str) -> Any:

@@ -165,7 +165,7 @@ def test_the_nominal_model_is_not_overwritten(files: Path, tmp_path: Path, capsy
     (tmp_path / "model.xml").write_text(text)
     assert cli.main(["trace", str(tmp_path / "model.xml"), str(files / "runs.csv"), "--out", str(tmp_path)]) == 2
     assert "--out" in (said := error(capsys))
-    assert "give another folder" in said
+    assert "save elsewhere" in said
     assert (tmp_path / "model.xml").read_text() == text
 
 
@@ -210,7 +210,7 @@ def test_what_a_terminal_cannot_show_keeps_nothing_from_being_written(
     monkeypatch.setattr(sys, "stdout", stdout)
     assert run(files, "--out", str(tmp_path / "plain")) == 0
     assert b"N?m" in stdout.buffer.getvalue()
-    monkeypatch.setattr(cli, "_say", refuse)
+    monkeypatch.setattr(cli, "say", refuse)
     assert run(files, "--out", str(tmp_path / "closed")) == 2
     for name in ("plain", "closed"):
         assert {"report.json", "model.xml"} <= {path.name for path in (tmp_path / name).iterdir()}

@@ -55,6 +55,7 @@ def run(parsed: argparse.Namespace) -> int:
     from sb3_rpto.algorithms.arguments import constructor_names
     from sb3_rpto.commands.progress import Progress, earnings, read_rows
     from sb3_rpto.commands.runs import RunFolder, beside, load_checkpoint
+    from sb3_rpto.commands.terminal import say
     from sb3_rpto.files import write_atomically
     from sb3_rpto.tracing import figures
 
@@ -65,6 +66,7 @@ def run(parsed: argparse.Namespace) -> int:
     settings = dict(parsed.set)
     options.check_names(settings, constructor_names(RPTO) - GIVEN)
     world = options.world(parsed.env, "ENV")
+    recordings.check_out(parsed.out, world.make())
     data = recordings.read(parsed.files, parsed.format)
     config = {
         "command": "adapt",
@@ -79,7 +81,7 @@ def run(parsed: argparse.Namespace) -> int:
     }
     folder = RunFolder.open(parsed.out, config)
     if folder.result.exists():
-        print(f"adapted already: {folder.model}")
+        say(f"adapted already: {folder.model}")
         return 0
     checkpoint = folder.newest_checkpoint()
     model: Any
@@ -103,5 +105,5 @@ def run(parsed: argparse.Namespace) -> int:
     model.learn(parsed.steps - model.num_timesteps, callback=progress, reset_num_timesteps=checkpoint is None)
     write_atomically(folder.model, model.save)
     folder.finish(progress.rows)
-    print(f"{earnings(model.loop)}; written: {folder.model}")
+    say(f"{earnings(model.loop)}; written: {folder.model}")
     return 0

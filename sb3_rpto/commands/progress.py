@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_rpto.commands.runs import CURVE, RunFolder, class_name
+from sb3_rpto.commands.terminal import say
 
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.closing import LoopCloser
@@ -41,7 +42,7 @@ class Progress(BaseCallback):
             loop.reports[0].save(self.run.path)
             verdict = loop.reports[0].verdict
             report = self.run.path / "report.html"
-            print(verdict if self.quiet else f"{loop.reports[0]}\n\nwritten: {report}", flush=True)
+            say(verdict if self.quiet else f"{loop.reports[0]}\n\nwritten: {report}")
 
     def _on_step(self) -> bool:
         taken = sum(self.num_timesteps >= self.total * n // COUNT for n in range(1, COUNT))
@@ -64,7 +65,7 @@ class Progress(BaseCallback):
             }
         )
         if not self.quiet:
-            print(f"{self.num_timesteps:>9,} of {self.total:,} steps: {earnings(model.loop)}", flush=True)
+            say(f"{self.num_timesteps:>9,} of {self.total:,} steps: {earnings(model.loop)}")
 
     def _write(self, folder: Path) -> None:
         self.model.save(folder / "model.zip")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from sb3_rpto.effects.model import ModelSource
     from sb3_rpto.tracing import Measurements
 
 #: Readers of recordings by the suffix of their files.
@@ -43,6 +45,24 @@ def check_candidates(candidates: list[str] | None) -> None:
     """
     if candidates == []:
         raise ValueError("--candidates is empty; name kinds of effects, or leave it out to look for all")
+
+
+def check_out(out: Path, model: ModelSource) -> None:
+    """Require that the simulator of a report can be written, before minutes of work.
+
+    :param out: folder that it goes to
+    :param model: the nominal one
+    :raises ValueError: nothing tells its MJCF, or it is in ``out`` itself
+    """
+    from sb3_rpto.effects.carry import check_free, save_corrected
+    from sb3_rpto.effects.model import file_of
+
+    try:
+        check_free(out, file_of(model))
+    except ValueError as error:
+        raise ValueError(f"--out: {error}") from None
+    with tempfile.TemporaryDirectory() as trial:
+        save_corrected(trial, model, [])
 
 
 def read(files: Sequence[str], form: str | None) -> Measurements:

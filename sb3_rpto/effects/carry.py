@@ -18,7 +18,7 @@ import numpy as np
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import LIBRARY, Effect, from_json
 from sb3_rpto.effects.mjcf import restore, rounded, write_mjcf
-from sb3_rpto.effects.model import ModelSource, differing, load_model, same_layout
+from sb3_rpto.effects.model import ModelSource, differing, file_of, load_model, same_layout
 from sb3_rpto.effects.names import near
 from sb3_rpto.effects.simulation import Simulation, prepare
 from sb3_rpto.effects.stance import StandingEnv, nominal_heights
@@ -106,11 +106,7 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
         ``folder`` holds a ``model.xml`` that must not be overwritten: the nominal one, or none of this function's
     :raises FileNotFoundError: an asset is missing
     """
-    if overwrites(folder, source):
-        raise ValueError(
-            f"{Path(folder) / 'model.xml'} is the nominal model, or was not saved here by an earlier trace, and would "
-            "be overwritten; save elsewhere"
-        )
+    check_free(folder, file_of(source))
     spec, nominal = load_model(source)
     if spec is None:
         raise ValueError(
@@ -135,17 +131,21 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
     write_bytes(folder / "effects.json", json.dumps(stored, indent=1).encode())
 
 
-def overwrites(folder: str | os.PathLike[str], source: ModelSource) -> bool:
-    """Whether a simulator saved to ``folder`` would replace its nominal model, or one that was not saved there so."""
+def check_free(folder: str | os.PathLike[str], file: Path | None) -> None:
+    """Require that a simulator saved to ``folder`` replaces one that was saved there so, and not its nominal model.
+
+    :param file: the nominal model's, from :func:`~sb3_rpto.effects.model.file_of`
+    :raises ValueError: it would
+    """
     saved = Path(folder) / "model.xml"
     if not saved.is_file():
-        return False
-    if not saved.with_name("effects.json").is_file():
-        return True  # an MjSpec or an environment may well be of that file
-    if not isinstance(source, str | os.PathLike) or str(source).lstrip().startswith("<"):
-        return False
-    file = Path(source).expanduser()
-    return file.is_file() and saved.samefile(file)
+        return
+    # Without effects.json an MjSpec, say, may well be of that file.
+    if not saved.with_name("effects.json").is_file() or (file is not None and saved.samefile(file)):
+        raise ValueError(
+            f"{saved} is the nominal model, or was not saved here by an earlier trace, and would be overwritten; save "
+            "elsewhere"
+        )
 
 
 def load_corrected(folder: str | os.PathLike[str]) -> Corrected:

@@ -56,6 +56,16 @@ def load_model(source: ModelSource) -> tuple[mujoco.MjSpec | None, mujoco.MjMode
     )
 
 
+def file_of(source: ModelSource) -> Path | None:
+    """The MJCF file that a model comes from, where it is of one."""
+    if isinstance(source, gym.Env):
+        source = getattr(source.unwrapped, "fullpath", None) or ""
+    if not isinstance(source, str | os.PathLike) or str(source).lstrip().startswith("<"):
+        return None
+    path = Path(source).expanduser()
+    return path if path.is_file() else None
+
+
 def _compiled(read: Any, source: str, name: str) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     try:
         spec = read(source)

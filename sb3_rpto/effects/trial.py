@@ -28,10 +28,11 @@ def try_out(model: mujoco.MjModel, effect: Effect) -> None:
     hooks = " or ".join(hook for hook in HOOKS if effect.overrides(hook)) + f" of {type(effect).__name__}"
     try:
         simulation = Simulation(model, [effect], 1)
+        (bound,) = simulation.effects
         motion = simulation.rollout(values, qpos, qvel, drive)
-        sent = effect.command(np.zeros(N), values, {}, model.opt.timestep)  # MuJoCo takes one that is no number for 0
-        seen = effect.observe(np.zeros((N, STEPS)), np.zeros((N, STEPS)), values[:, None])
-        made = (*motion, sent, effect.late(values), *seen, *effect.unobserve(*seen, values[:, None]))
+        sent = bound.command(np.zeros(N), values, {}, model.opt.timestep)  # MuJoCo takes one that is no number for 0
+        seen = bound.observe(np.zeros((N, STEPS)), np.zeros((N, STEPS)), values[:, None])
+        made = (*motion, sent, bound.late(values), *seen, *bound.unobserve(*seen, values[:, None]))
         finite = all(np.isfinite(array).all() for array in made)
     except Exception as error:  # whatever somebody's code raises
         raise ValueError(

@@ -13,6 +13,8 @@ MIN_ROWS = 5
 """Fewest samples of a run: a cubic needs four points, one more leaves something to smooth."""
 GAP = 5.0
 """A step in time longer than this many median steps is a gap."""
+SKIPPED = 1.5
+"""Where a clock is regular, a sample is missing in a step of more than so many median steps."""
 JITTER = 0.05
 """Time is called jittered when 5 % of the steps are off the median by more than this fraction of it."""
 FEWEST_READINGS, FEWEST_STEPS = 20, 5
@@ -79,6 +81,15 @@ def jitter(time: np.ndarray) -> float:
     steps = np.diff(time)
     median = float(np.median(steps))
     return float(np.quantile(np.abs(steps - median), 0.95)) / median
+
+
+def missing(time: np.ndarray) -> int:
+    """Number of steps over which, by the others, at least one sample is missing, gaps left out.
+
+    :param time: increasing times in s, shape (T,) with T >= 2
+    """
+    steps = np.diff(time) / np.median(np.diff(time))
+    return int(np.count_nonzero((steps > SKIPPED) & (steps <= GAP)))
 
 
 def unwrap(angle: np.ndarray, change: np.ndarray | None = None) -> tuple[np.ndarray, int, bool]:

@@ -75,6 +75,9 @@ def read_columns(names: Iterable[str], file: str) -> Columns:
     :raises ValueError: unknown, doubled or missing columns
     """
     names = list(names)
+    nameless = [name for name in names if not isinstance(name, str)]
+    if nameless:
+        raise ValueError(f"{file}: column {nameless[0]!r} has no name; give each one, such as 'time' or 'qpos.<joint>'")
     doubled = sorted({name for name in names if names.count(name) > 1})
     if doubled:
         raise ValueError(f"{file}: column {doubled[0]!r} is there twice; rename or remove one")

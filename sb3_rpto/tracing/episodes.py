@@ -129,7 +129,8 @@ def runs_of(file: str, table: Table) -> dict[str | None, dict[str, np.ndarray]]:
         if len(bad):
             raise ValueError(
                 f"{file}: column {name!r} has {len(bad)} NaN or infinite value(s), first in row {bad[0]} "
-                "(counted from 0 below the header); drop those rows, a gap is handled"
+                "(counted from 0 below the header); keep a row's command and interpolate the rest where one or a few "
+                "in succession are missing, and drop the rows where many are: a gap is handled"
             )
     if "episode" not in rows:
         return {None: rows}
@@ -273,6 +274,12 @@ def _look_at_samples(episode: Episode, tell: _Tell) -> None:
             "jitter",
             f"steps vary by {spread:.0%} around their median of {np.median(np.diff(episode.time)):.4g} s; kept as they "
             "are: where the logger, not the robot, was late, give the times at which the samples were taken",
+        )
+    elif late := checks.missing(episode.time):
+        tell(
+            "missing rows",
+            f"{late} step(s) are longer than the others, and no gaps: the command of a row that is missing is not "
+            "known, and the one before is held instead. Keep such rows with their commands, and interpolate the rest",
         )
     rows = checks.held(episode.qpos)
     if rows is not None:

@@ -115,7 +115,9 @@ def whole_runs(
     differences = []
     for e in data.episodes:
         one = replace(data, episodes=[e])
-        length = float(e.time[-1] - e.time[first_sample(simulation.model, e, data.whole_states)]) * 0.999
+        begin = first_sample(simulation.model, e, data.whole_states)
+        begin += int(np.argmax(e.usable[begin:]))
+        length = float(e.time[-1] - e.time[begin]) * 0.999
         try:
             windows = cut(simulation.model, one, sigma, length, 1)
         except ValueError:

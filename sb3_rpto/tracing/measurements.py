@@ -130,6 +130,8 @@ class Measurements:
                 frame = pandas.read_parquet(path)
             except (ValueError, OSError) as error:  # pyarrow's own of broken files are such
                 raise ValueError(f"{path}: no whole Parquet file ({error}); write it again") from error
+            if any(frame.index.names):  # pandas puts what was its index back there
+                frame = frame.reset_index()
             tables[path] = {name: frame[name].to_numpy() for name in frame.columns}
         return cls.from_tables(tables)
 

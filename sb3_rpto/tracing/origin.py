@@ -111,7 +111,7 @@ def origin(
         stepped = discretised(model, kind, fine=True)
         there = given(stepped, declared, known)
         simulation = Simulation(stepped, there, threads)
-        scales = typical(simulation, force_residuals(simulation, simulation.null, kind)).scales(there)
+        scales = typical(simulation, force_residuals(simulation, simulation.null, kind)).scales(simulation.effects)
         problem = Problem(simulation, cut(stepped, kind, noise, horizon, WINDOWS), scales)
         fit = problem.fit(simulation.null, np.flatnonzero(simulation.strength), iterations=ITERATIONS)
         return float(np.median(fit.errors))

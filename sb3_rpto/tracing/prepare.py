@@ -188,7 +188,7 @@ def prepare(
     fine = Simulation(nominal, effects, threads)
     if (data.exact or data.simulated) and idle(fine, fitted, sigma):
         train, select, test, fitted = (replace(d, idle=True) for d in (train, select, test, fitted))
-    scales = typical(fine, force_residuals(fine, fine.null, fitted)).scales(effects)
+    scales = typical(fine, force_residuals(fine, fine.null, fitted)).scales(fine.effects)
     rough = Simulation(discretised(compiled, fitted, fine=False), effects, threads)
     longer = _longer(rough.model, train, select, sigma, length) if horizon is None else None
     return SetUp(spec, compiled, findings, train, select, test, fitted, sigma, fine, rough, scales, length, longer)

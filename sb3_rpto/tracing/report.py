@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
-from sb3_rpto.effects.carry import carried_by, save_corrected
+from sb3_rpto.effects.carry import carried_by, check_free, save_corrected
 from sb3_rpto.files import json_text, plain, write_text
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import Adequacy
@@ -132,6 +132,7 @@ class Report:
     :param horizon: length of the windows in s
     :param seed: of the trace
     :param source: the model as it was given
+    :param file: the MJCF file that it came from, if any
     :param simulation: the model with all effects, those of no strength among them
     :param values_before: its parameters with the declared model fitted, (p,)
     :param values_after: with the corrected one, (p,)
@@ -162,6 +163,7 @@ class Report:
     horizon: float
     seed: int
     source: Any
+    file: Path | None
     simulation: Simulation
     values_before: np.ndarray
     values_after: np.ndarray
@@ -354,7 +356,7 @@ class Report:
         :return: the folder
         :raises ImportError: matplotlib is not installed; nothing is written then
         :raises ValueError: the model came as an ``MjModel``, whose MJCF nothing tells; nothing is written then. Where
-            the model cannot be written for another reason, the report is
+            the model cannot be written for another reason, the report is: where ``folder`` is the nominal model's, say
         """
         from sb3_rpto.tracing.html import render
 
@@ -362,6 +364,7 @@ class Report:
         # Rendered before anything is written: what fails there leaves the folder as it was.
         page, data = render(self), json_text(self.to_json())
         try:
+            check_free(out, self.file)
             save_corrected(out, self.source, self.correction)
         finally:
             # After a long trace, a file that is missing must not lose what was found.

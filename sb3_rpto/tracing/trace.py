@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
+from sb3_rpto.effects.model import file_of
 from sb3_rpto.effects.units import units_at
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import SETTLED
@@ -177,6 +178,7 @@ def trace(
         seed=seed,
         # As it was: an environment's model may be corrected before the report is saved.
         source=model if set_up.spec is None else (set_up.spec, set_up.nominal),
+        file=file_of(model),
         simulation=simulation,
         values_before=before.values,
         values_after=final,

@@ -227,8 +227,13 @@ def cut(
             else:
                 begin += 1
     if not starts:
-        longest = max(e.time[-1] - e.time[0] for e in data.episodes)
-        raise ValueError(f"no episode holds a window of {horizon:g} s (the longest has {longest:.3g} s); lower horizon")
+        whole, left = (
+            max(e.time[-1] - e.time[begin(e)] for e in data.episodes)
+            for begin in (lambda e: 0, lambda e: first_sample(model, e, data.whole_states))
+        )
+        waits = f", {left:.3g} s after what actuators remember and smoothing needs" if left < whole else ""
+        remedy = "lower horizon" if left > 2.5 * step else "record longer runs"
+        raise ValueError(f"no episode holds a window of {horizon:g} s (the longest has {whole:.3g} s{waits}); {remedy}")
     if len(starts) > most:
         starts = [starts[i] for i in np.linspace(0, len(starts) - 1, most).round().astype(int)]
     return _build(model, data, sigma, horizon, starts)

@@ -108,3 +108,11 @@ def test_bad_input_is_told_before_the_trace(given: Path, tmp_path: Path, capsys,
     assert adapt(given, tmp_path / "out", *options, **passed) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
+
+
+def test_a_simulator_that_could_not_be_written_is_told_before_the_trace(given: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "model.xml").write_text("<mujoco/>")
+    assert adapt(given, tmp_path) == 2
+    assert "error: --out: " in (said := capsys.readouterr().err)
+    assert "would be overwritten; save elsewhere" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["model.xml"]

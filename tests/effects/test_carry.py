@@ -377,6 +377,11 @@ def test_files_that_mujoco_does_not_read_are_refused(tmp_path, monkeypatch):
         save_corrected(tmp_path / "out", path, [])
 
 
+def save_pole(folder):
+    save_corrected(folder, gym.make("InvertedPendulum-v5"), [])
+    return folder / "model.xml"
+
+
 def test_the_nominal_model_is_not_overwritten(tmp_path):
     (tmp_path / "model.xml").write_text(PLAIN)
     for source in (tmp_path / "model.xml", mujoco.MjSpec.from_file(str(tmp_path / "model.xml"))):
@@ -387,8 +392,10 @@ def test_the_nominal_model_is_not_overwritten(tmp_path):
     assert (tmp_path / "model.xml").read_text() == PLAIN
     save_corrected(tmp_path / "out", PLAIN, [])
     save_corrected(tmp_path / "out", PLAIN, [])  # what an earlier save left is another matter
-    with pytest.raises(ValueError, match="elsewhere"):
-        save_corrected(tmp_path / "out", tmp_path / "out" / "model.xml", [])
+    of_it = gym.make("InvertedPendulum-v5", xml_file=str(save_pole(tmp_path / "pole")))
+    for folder, source in (("out", tmp_path / "out" / "model.xml"), ("pole", of_it)):
+        with pytest.raises(ValueError, match="elsewhere"):
+            save_corrected(tmp_path / folder, source, [])
 
 
 def test_torn_folders_are_refused(tmp_path):

@@ -157,6 +157,17 @@ def test_whole_runs_are_predicted_to_their_end() -> None:
     assert pytest.approx(windows.measured.shape[1]) == RATE * 2.9
 
 
+def test_a_whole_run_begins_where_its_state_is_known() -> None:
+    data = recorded(noise=0.0, exact=True)
+    known = [np.arange(len(e)) >= 3 for e in data.episodes]
+    late = replace(data, episodes=[replace(e, usable=u, placed=u) for e, u in zip(data.episodes, known)])
+    simulation = Simulation(compiled(), [], 1)
+    found = whole_runs(simulation, simulation.null, late, SIGMA)
+    assert found is not None
+    assert found.windows == len(data.episodes)
+    assert found.rmse[0] < 1e-9
+
+
 def test_a_single_block_or_run_gives_no_interval() -> None:
     data = recorded(duration=2.5)
     one = replace(data, episodes=data.episodes[:1])

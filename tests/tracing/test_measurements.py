@@ -148,7 +148,11 @@ def planted(value, row=7, column="qpos.hinge"):
         (edited(episode=np.repeat([0, np.nan], 100)), r"'episode' is empty in row 100"),
         (edited(ctrl__motor=np.repeat(["on"], 200)), r"'ctrl.motor' holds .*'on'.*no number, in row 0.*correct"),
         (edited(ctrl__motor=np.zeros(3)), r"one shape"),
-        (planted(np.nan), r"a: column 'qpos.hinge' has 1 NaN or infinite value\(s\), first in row 7"),
+        (
+            planted(np.nan),
+            r"a: column 'qpos.hinge' has 1 NaN or .* first in row 7.* keep a row's command and",
+        ),
+        ({0: np.zeros(200), **swing()}, r"a: column 0 has no name; give each one"),
         (planted(np.inf, column="ctrl.motor"), r"'ctrl.motor' has 1 NaN or infinite"),
         (planted(0.01, row=2, column="time"), r"a, episode a: column 'time' does not increase at row 2"),
         (swing(n=4), r"4 rows are too few; give at least 5"),
@@ -315,6 +319,15 @@ def test_jitter_is_reported():
     time = np.arange(200) * 0.01 + np.random.default_rng(0).uniform(-0.002, 0.002, 200)
     table = {"time": time, "qpos.hinge": np.sin(time), "qvel.hinge": np.cos(time)}
     assert kinds(Measurements.from_tables({"a": table})) == ["jitter"]
+
+
+def test_rows_that_are_missing_from_a_regular_clock_are_told():
+    """As little as the last command's hold over them makes a right model wrong."""
+    table, kept = swing(), np.ones(200, dtype=bool)
+    kept[[20, 50, 51, 52, 90]] = False
+    (found,) = Measurements.from_tables({"a": {name: values[kept] for name, values in table.items()}}).findings
+    assert found.kind == "missing rows"
+    assert found.message.startswith("3 step(s) are longer")
 
 
 def test_wrapped_angle_is_unwrapped_and_reported():
@@ -503,6 +516,12 @@ def test_tables_may_be_named_by_numbers_and_are_not_columns():
     for table in (swing(), dict(frame.items())):
         with pytest.raises(TypeError, match=r"write \{'run': table\}"):
             Measurements.from_tables(table)
+
+
+def test_an_index_of_pandas_is_a_column(tmp_path):
+    pd.DataFrame(swing()).set_index("time").to_parquet(tmp_path / "run.parquet")
+    (run,) = Measurements.from_parquet(tmp_path / "run.parquet").episodes
+    np.testing.assert_array_equal(run.time, swing()["time"])
 
 
 def test_files_that_are_broken_are_named(tmp_path):

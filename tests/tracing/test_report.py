@@ -13,7 +13,7 @@ from sb3_rpto.effects.carry import load_corrected
 from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.effects.units import units_at
-from sb3_rpto.tracing import Report, wording
+from sb3_rpto.tracing import Report, trace, wording
 from sb3_rpto.tracing.report import Traced
 
 SLIDE = """<mujoco><worldbody><body name="cart">
@@ -115,6 +115,17 @@ def test_a_model_whose_mjcf_is_unknown_is_refused_and_nothing_written(report: Re
     with pytest.raises(ValueError, match="give its file"):
         compiled.save(tmp_path / "out")
     assert not (tmp_path / "out" / "report.json").exists()
+
+
+def test_the_model_that_was_traced_is_not_overwritten(report: Report, planted, tmp_path: Path) -> None:
+    """Though an earlier trace saved it, and the report holds it as it was."""
+    report.save(tmp_path)
+    text = (tmp_path / "model.xml").read_text()
+    later = trace(tmp_path / "model.xml", planted.measurements, ["pole.mass"], candidates=[])
+    with pytest.raises(ValueError, match=r"is the nominal model.*save elsewhere"):
+        later.save(tmp_path)
+    assert (tmp_path / "model.xml").read_text() == text
+    assert later.to_json()["verdict"] in (tmp_path / "report.json").read_text()
 
 
 @pytest.mark.parametrize(

@@ -332,6 +332,14 @@ def test_a_horizon_longer_than_every_episode_is_refused_with_the_longest() -> No
         cut(compiled(), ramps([clock(100), 3 + clock(300)]), SIGMA, 5.0, 10)
 
 
+def test_what_filters_remember_is_taken_off_the_longest() -> None:
+    text = PENDULUM.replace("<motor ", '<general dyntype="filter" dynprm="1" ')
+    with pytest.raises(ValueError, match=r"longest has 7\.5 s, 2\.5 s after what .* remember .*; lower horizon"):
+        cut(mujoco.MjModel.from_xml_string(text), ramps([clock(1_500)]), SIGMA, 3.0, 10)
+    with pytest.raises(ValueError, match=r"longest has \S+ s, 0 s after what .* remember .*; record longer"):
+        cut(mujoco.MjModel.from_xml_string(text), ramps([clock(1_000)]), SIGMA, 3.0, 10)
+
+
 def test_a_horizon_shorter_than_two_steps_is_refused_with_the_step() -> None:
     with pytest.raises(ValueError, match=r"window of 0\.005 s holds fewer than two steps of 0\.005 s; raise horizon"):
         cut(compiled(), ramps([clock(100)]), SIGMA, 0.005, 10)
