@@ -193,13 +193,14 @@ class KeepBest(TransferCallback):
     which are of a stochastic policy and not comparable, no longer count; a policy kept by them stays only until the
     first evaluation.
 
-    :raises ValueError: outside of an ``EvalCallback``
+    :raises ValueError: outside of an ``EvalCallback``, when ``learn()`` begins
     """
+
+    #: what it must be in; learn() checks it, since in a list a callback knows its parent only after it is initialised
+    inside = EvalCallback
 
     def _init_callback(self) -> None:
         super()._init_callback()
-        if not isinstance(self.parent, EvalCallback):
-            raise ValueError("KeepBest works inside EvalCallback(eval_env, callback_on_new_best=KeepBest())")
         self.model.best_by = "evaluation"
 
     def _on_step(self) -> bool:

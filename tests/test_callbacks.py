@@ -12,7 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EvalCallback,
+    StopTrainingOnRewardThreshold,
+)
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -437,3 +442,10 @@ def test_training_and_evaluation_are_never_compared(tmp_path):
 def test_keep_best_belongs_into_an_evaluation():
     with pytest.raises(ValueError, match="callback_on_new_best"):
         small(RPO).learn(5, KeepBest(), source_timesteps=0)
+
+
+def test_keep_best_may_be_one_of_several_in_an_evaluation():
+    both = CallbackList([KeepBest(), StopTrainingOnRewardThreshold(0.0)])
+    model = small(RPO).learn(30, EvalCallback(pendulum(12.0), both, eval_freq=10, verbose=0), source_timesteps=0)
+    assert model.best_by == "evaluation"
+    assert model.best_mean_reward > -1e5

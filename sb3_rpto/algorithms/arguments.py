@@ -325,13 +325,19 @@ def _first_trace(model: TwoWorlds, loop: LoopCloser) -> int:
 
 
 def check_callbacks(callback: BaseCallback, target_env: VecEnv | None) -> None:
-    """Refuse a callback that evaluates in the target that D_target is collected from.
+    """Refuse a callback that evaluates in the target that D_target is collected from, or is in the wrong place.
 
-    Its steps would be counted nowhere, and the episode under way would jump.
+    The steps of the former would be counted nowhere, and the episode under way would jump.
 
     :raises ValueError: naming the callback
     """
     for one in _callbacks(callback):
+        inside = getattr(one, "inside", None)
+        if inside is not None and not isinstance(one.parent, inside):
+            name = type(one).__name__
+            raise ValueError(
+                f"{name} works inside {inside.__name__}: {inside.__name__}(eval_env, callback_on_new_best={name}())"
+            )
         evaluated = getattr(one, "eval_env", None)
         if isinstance(evaluated, VecEnv) and target_env is not None and members(evaluated) & members(target_env):
             raise ValueError(

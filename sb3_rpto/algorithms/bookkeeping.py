@@ -19,6 +19,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.logger import HumanOutputFormat, Logger
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_rpto.algorithms.machine import check_machine, check_simulator, doubt, doubt_rules
@@ -148,9 +149,11 @@ class TwoWorlds(PolicySnapshots):
                     stacklevel=2,
                 )
                 self.replay_buffer.reset()
-        if (self.target_env is not None or self._offline) and self._resume_state is not None:
-            # Where that target stood, and a step of it that is not stored.
-            self._resume_state |= {"target": None, "last_obs": None, "unstored_step": None}
+        if self.target_env is not None or self._offline:
+            self._round_open, self._collected, self._rollout_began_at = False, 1, self.num_timesteps
+            if self._resume_state is not None:
+                # Where that target stood, and a step of it that is not stored.
+                self._resume_state |= {"target": None, "last_obs": None, "unstored_step": None}
         self._bind_rules(venv, of_target=True)
         self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
         self._offline = self._traces_log = False
@@ -205,16 +208,19 @@ class TwoWorlds(PolicySnapshots):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Set the source environment, as in SB3; the target keeps sharing its normalisation."""
+        source = self._wrap_env(env, self.verbose)
+        # All that may refuse it comes before anything changes.
+        check_for_correct_spaces(source, self.observation_space, self.action_space)
+        check_simulator(source, self.dynamics)
+        if self.target_env is not None:
+            self._check_pair(source, find_ledger(self.target_env).venv)
         last_obs = self._last_obs
-        super().set_env(env, force_reset)
-        if self.env is not None:
-            check_simulator(self.env, self.dynamics)
-            self._bind_rules(self.env, of_target=False)
+        super().set_env(source, force_reset)
+        self._bind_rules(source, of_target=False)
         self._last_obs = last_obs  # SB3 forgets the observation of what it takes to be the training env
-        self._source_world = None
-        if self.env is not None and self.target_env is not None:
-            self._check_pair(self.env, find_ledger(self.target_env).venv)
-            self.target_env = share_normalisation(find_ledger(self.target_env), self.env)
+        self._source_world = self._source_first_obs = None
+        if self.target_env is not None:
+            self.target_env = share_normalisation(find_ledger(self.target_env), source)
 
     def get_vec_normalize_env(self) -> VecNormalize | None:
         """The source's VecNormalize, which learns the statistics, also while SB3 collects in the target."""

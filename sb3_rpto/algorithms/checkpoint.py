@@ -186,6 +186,7 @@ def capture(model: Resumable) -> dict[str, Any]:
         "random": random.getstate(),
         "numpy": np.random.get_state(),
         "torch": th.get_rng_state(),
+        "actions": model.action_space.np_random.bit_generator.state,
         "source": None if model.env is None else save_state(model.env),
         "target": None if model.target_env is None else save_state(find_ledger(model.target_env).venv),
         "source_world": None if model._source_world is None else model._source_world.get_state(),
@@ -229,7 +230,7 @@ def resume(model: Resumable) -> None:
             stacklevel=3,
         )
     if not model._reseeded:
-        _restore_streams(state)
+        _restore_streams(model, state)
 
 
 def resume_source_phase(model: Resumable) -> None:
@@ -241,13 +242,14 @@ def resume_source_phase(model: Resumable) -> None:
     _put_back(model.env, state["source"])
     model._source_first_obs = np.asarray(model.env.reset())
     if not model._reseeded:
-        _restore_streams(state)
+        _restore_streams(model, state)
 
 
-def _restore_streams(state: dict[str, Any]) -> None:
+def _restore_streams(model: Resumable, state: dict[str, Any]) -> None:
     random.setstate(state["random"])
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
+    model.action_space.np_random.bit_generator.state = state["actions"]
 
 
 def _put_source_back(model: Resumable, state: dict[str, Any]) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence, Set
 from typing import Any
 
+import cloudpickle
 from gymnasium import spaces
 
 from sb3_rpto.dynamics.factory import is_mujoco
@@ -106,6 +107,13 @@ def check_rules(kwargs: dict[str, Any], observation_space: spaces.Space, action_
     for name in ("reward_fn", "termination_fn"):
         if kwargs.get(name) is None:
             continue
+        try:
+            cloudpickle.dumps(kwargs[name])
+        except Exception as error:  # whatever an object's own pickling raises
+            raise ValueError(
+                f"dynamics_kwargs[{name!r}] does not pickle ({error}), and checkpoints hold it; give a function of the "
+                "tensors alone"
+            ) from error
         found = misfit(kwargs[name], observation_space, action_space)
         if found is not None:
             raise ValueError(

@@ -107,8 +107,9 @@ class ErrorNetwork(nn.Module):
             self.input_mean.copy_(inputs.mean(dim=0))
             self.input_std.copy_(inputs.std(dim=0, unbiased=False).clamp(min=1e-6))
             self.scale.copy_(errors.std(unbiased=False).clamp(min=1e-12))
-            self.fitted.fill_(True)
-        return regress(self._standardised, self.optimizer, inputs, (errors / self.scale).float(), n_steps)
+        error = regress(self._standardised, self.optimizer, inputs, (errors / self.scale).float(), n_steps)
+        self.fitted.fill_(True)
+        return error
 
 
 def _inputs(observations: th.Tensor, actions: th.Tensor, predicted: Prediction) -> th.Tensor:

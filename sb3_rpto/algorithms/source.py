@@ -113,7 +113,7 @@ class EpisodeSource(SourceWorld):
         steps, held = 0, math.inf  # for how many steps gSDE's noise was held
         while steps < n_steps:
             if random:
-                actions = np.array([self.env.action_space.sample() for _ in range(self.env.num_envs)])
+                actions = np.array([model.action_space.sample() for _ in range(self.env.num_envs)])
             else:
                 if model.use_sde and held >= _sde_hold(model):
                     model.actor.reset_noise(self.env.num_envs)

@@ -304,6 +304,10 @@ class TransferAlgorithm(Looping):
         :raises ValueError: when the source model's spaces are not the environment's
         """
         sac = warm.load_sac(source_model, kwargs.get("device", "auto"))
+        if isinstance(env, str):
+            env = gym.make(env)
+        check_environment(env, "env")
+        warm.check_source_spaces(sac, env)
         settings = {**warm.carried_arguments(sac), **kwargs}
         model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **settings)
         # "auto" asks for a learned temperature, a number or "auto_0.5" for that one.

@@ -13,6 +13,7 @@ import numpy as np
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_rpto.algorithms import recorded
@@ -73,16 +74,23 @@ def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
         ) from error
 
 
+def check_source_spaces(sac: SAC, env: GymEnv) -> None:
+    """Require that a source model is one of this environment.
+
+    :raises ValueError: naming the space that differs
+    """
+    for name in ("observation_space", "action_space"):
+        ours, theirs = getattr(env, name), getattr(sac, name)
+        if ours.shape != theirs.shape:
+            raise ValueError(f"source_model has {name} {theirs}, env has {ours}; pass the agent of this environment")
+
+
 def carry_over(sac: SAC, model: Resumable, temperature: bool = True) -> None:
     """Take over actor, critics, their targets, the temperature and the state of every optimiser of the same kind.
 
     :param temperature: whether to take over the temperature, too
-    :raises ValueError: when the source model's spaces or networks are not the model's
+    :raises ValueError: when the source model's networks are not the model's
     """
-    for name in ("observation_space", "action_space"):
-        ours, theirs = getattr(model, name), getattr(sac, name)
-        if ours.shape != theirs.shape:
-            raise ValueError(f"source_model has {name} {theirs}, env has {ours}; pass the agent of this environment")
     if sac.action_space != model.action_space:
         warnings.warn(
             f"source_model was trained with {sac.action_space}, env has {model.action_space}: the same output of the "
@@ -199,6 +207,7 @@ def _train_in_source(model: Resumable, source_timesteps: int, progress_bar: bool
 
         bar = tqdm(total=source_timesteps, initial=model._pretrained_steps, desc="source")
     source = EpisodeSource(model.env, model._source_first_obs)
+    model._source_first_obs = None  # a phase that is interrupted goes on elsewhere
     model._pretraining = True
     report_every = max(source_timesteps // 10, 1)
     next_report = (model._pretrained_steps // report_every + 1) * report_every

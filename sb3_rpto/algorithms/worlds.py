@@ -38,6 +38,7 @@ class TargetLedger(VecEnvWrapper):
         self._purpose = "other"
         self._allowance: int | None = None
         self._left_at: list[tuple[Any, ...]] | None = None
+        self._stepping = False  # still so after a step that was interrupted
 
     @contextmanager
     def spending(self, purpose: str, allowance: int) -> Iterator[None]:
@@ -53,7 +54,7 @@ class TargetLedger(VecEnvWrapper):
 
     def begin(self) -> None:
         """The episode that was just begun, or taken up again, is the algorithm's."""
-        self.disturbed = False
+        self.disturbed = self._stepping = False
         self._left_at = whereabouts(self.venv)
 
     def check(self, observations: np.ndarray, rewards: np.ndarray) -> None:
@@ -72,8 +73,14 @@ class TargetLedger(VecEnvWrapper):
 
         :param warn: where it was to go on, and the steps were not counted
         """
-        moved = self.moved()
-        if moved and warn:
+        moved = self.moved() or self._stepping
+        if self._stepping and warn:
+            warnings.warn(
+                "the last learn() was interrupted within a step of the target: a new episode begins, and that step is "
+                "counted but not in D_target",
+                stacklevel=5,
+            )
+        elif moved and warn:
             warnings.warn(
                 "the environment that was passed as target_env was stepped or reset since the last learn(): a new "
                 "episode begins, and target_spent does not hold those steps; evaluate in an environment of its own",
@@ -105,17 +112,19 @@ class TargetLedger(VecEnvWrapper):
                 )
             self._allowance -= self.num_envs
         self.spent[self._purpose] = self.spent.get(self._purpose, 0) + self.num_envs
+        self._stepping = True
         self.venv.step_async(actions)
 
     def step_wait(self) -> Any:
         """The target's answer, unchanged."""
         answer = self.venv.step_wait()
         self.unstored, self._left_at = True, whereabouts(self.venv)  # not before: the step may be interrupted
+        self._stepping = False
         return answer
 
     def reset(self) -> Any:
         """Reset the target; a reset is not counted as a step."""
-        self.unstored, self.disturbed = False, True
+        self.unstored, self.disturbed, self._stepping = False, True, False
         answer = self.venv.reset()
         self._left_at = whereabouts(self.venv)
         return answer

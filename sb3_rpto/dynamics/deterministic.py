@@ -153,6 +153,7 @@ class DeterministicDynamics(EnsembleDynamics):
             th.nn.utils.clip_grad_norm_(self.networks.parameters(), MAX_GRADIENT)
             self.optimizer.step()
             losses.append(loss.detach())
+        self.fitted.fill_(True)
         last = th.stack(losses[-max(1, n_steps // 10) :])
         seconds = time.perf_counter() - started
         return {"open_loop_loss": float(last.mean()), "steps": float(n_steps), "fit_seconds": seconds}

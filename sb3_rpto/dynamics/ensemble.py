@@ -238,6 +238,7 @@ class EnsembleDynamics(Dynamics):
                 parameter.copy_(kept)
         if len(held.inputs) >= self.min_holdout_for_elites:
             self.elites.copy_(best_error.argsort()[: self.n_elites])
+        self.fitted.fill_(True)  # not before: a first fit that is interrupted is made again
         return {
             "holdout_nll": float(best_nll[self.elites].mean()),
             "holdout_rmse": float(best_error[self.elites].mean().sqrt()),
@@ -289,7 +290,7 @@ class EnsembleDynamics(Dynamics):
         return nll, (held.weights * heads.squared_error(held.targets, held.terminations)).mean(dim=1)
 
     def _prepare(self, data: Transitions, weights: th.Tensor | None) -> tuple[_Examples, _Examples]:
-        """Check, fit the scaler if this is the first time, standardise and split."""
+        """Check, fit the scaler if nothing was fitted before, standardise and split."""
         n = len(data)
         if n < 2:
             raise ValueError(f"data must hold at least 2 transitions (one to train on, one to hold out), got {n}")
@@ -312,7 +313,6 @@ class EnsembleDynamics(Dynamics):
                 mean, std = _moments(values[~held_out])
                 getattr(self, f"{prefix}_mean").copy_(mean)
                 getattr(self, f"{prefix}_std").copy_(std)
-            self.fitted.fill_(True)
         dtype = self.input_mean.dtype
         examples = _Examples(
             self._inputs(data.observations, data.actions),

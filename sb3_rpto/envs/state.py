@@ -246,7 +246,7 @@ def _whereabouts(env: gym.Env) -> tuple[Any, ...]:
     *around, base = layers(env)
     known: list[Any] = [layer._elapsed_steps for layer in around if isinstance(layer, wrappers.TimeLimit)]
     if type(base) in _ENVS:
-        known.append(np.array(base.state).tobytes())  # type: ignore[attr-defined]
+        known.append(np.array(getattr(base, "state", None)).tobytes())  # some have none before the first reset
     elif _is_mujoco_task(base):
         known += [base.data.time, base.data.qpos.tobytes()]  # type: ignore[attr-defined]
     return tuple(known)

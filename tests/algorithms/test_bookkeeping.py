@@ -3,18 +3,39 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import ALGORITHMS, small
+from conftest import ALGORITHMS, SMALL_ENSEMBLE, SMALL_POLICY, small
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_rpto import RPO
+from sb3_rpto import RPO, RPTO
 from sb3_rpto.buffers import chronological
 
 
 def short(g=12.0):
     return gym.make("Pendulum-v1", g=g, max_episode_steps=8)
+
+
+def assert_moves_as_a_pendulum(rows):
+    """The angle of each transition has turned by the speed after it."""
+    reached = np.arctan2(rows["next_observations"][:, 1], rows["next_observations"][:, 0])
+    left = np.arctan2(rows["observations"][:, 1], rows["observations"][:, 0])
+    turned = (reached - left + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(turned, 0.05 * rows["next_observations"][:, 2], atol=1e-5)
+
+
+class Interrupted(gym.Wrapper):
+    """Stops the run by Ctrl-C within a step: after the environment has moved, before it answers."""
+
+    steps = 0
+
+    def step(self, action):
+        answer = super().step(action)
+        self.steps += 1
+        if self.steps == 21:
+            raise KeyboardInterrupt
+        return answer
 
 
 class Watch(BaseCallback):
@@ -120,10 +141,7 @@ def test_an_evaluation_in_the_target_itself_makes_up_no_transition():
     rows = chronological(model.replay_buffer.target)
     goes_on = np.isclose(rows["next_observations"][:-1], rows["observations"][1:]).all(axis=1)
     assert np.flatnonzero(~goes_on).tolist() == [7, 10, 18]  # episodes of 8 steps end, and that of the evaluation began
-    reached = np.arctan2(rows["next_observations"][:, 1], rows["next_observations"][:, 0])
-    left = np.arctan2(rows["observations"][:, 1], rows["observations"][:, 0])
-    turned = (reached - left + np.pi) % (2 * np.pi) - np.pi
-    np.testing.assert_allclose(turned, 0.05 * rows["next_observations"][:, 2], atol=1e-5)  # as a pendulum moves
+    assert_moves_as_a_pendulum(rows)
 
 
 def test_a_callback_that_evaluates_in_the_target_itself_is_stopped():
@@ -141,3 +159,73 @@ def test_a_callback_that_evaluates_in_the_target_itself_is_stopped():
     with pytest.warns(UserWarning, match="a new episode begins"):
         model.learn(15, reset_num_timesteps=False, source_timesteps=0)
     assert model.replay_buffer.target.size() == model.num_timesteps == 20
+
+
+def test_a_step_of_the_target_that_was_interrupted_is_no_somebody_elses():
+    model = small(RPO, short(10.0), Interrupted(short()))
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(30, source_timesteps=0)
+    with pytest.warns(UserWarning, match="interrupted within a step") as caught:
+        model.learn(10, reset_num_timesteps=False, source_timesteps=0)
+    assert not any("stepped or reset" in str(one.message) for one in caught)
+    assert model.target_spent == {"learning": 31}  # 21 and 10
+    assert model.replay_buffer.target.size() == 30
+    assert_moves_as_a_pendulum(chronological(model.replay_buffer.target))
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_a_source_phase_that_goes_on_begins_a_new_episode(n_envs):
+    source = DummyVecEnv(
+        [lambda: Interrupted(gym.make("Pendulum-v1")), *[lambda: gym.make("Pendulum-v1")] * (n_envs - 1)]
+    )
+    model = small(RPO, source, short())
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(5, source_timesteps=150)
+    model.learn(5, reset_num_timesteps=False, source_timesteps=150)
+    rows = chronological(model.replay_buffer.source)
+    assert len(rows["rewards"]) >= 150
+    assert_moves_as_a_pendulum(rows)
+
+
+def test_a_source_that_is_refused_changes_nothing():
+    source, target = short(10.0), short()
+    model = small(RPO, source, target)
+    with pytest.raises(ValueError, match="target_env is env"):
+        model.set_env(target)
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        model.set_env(gym.make("MountainCarContinuous-v0"))
+    assert model.env.envs[0].unwrapped is source.unwrapped
+    model.learn(20, source_timesteps=50)
+    assert model.target_spent == {"learning": 20}
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "MountainCarContinuous-v0"])
+def test_another_source_need_not_have_been_reset(name):
+    model = small(RPO, gym.make(name), gym.make(name)).learn(20, source_timesteps=0)
+    model.set_env(gym.make(name))
+    model.learn(20, reset_num_timesteps=False)
+    assert model.num_timesteps == 40
+
+
+def test_random_actions_in_the_source_follow_the_seed_after_loading(tmp_path):
+    small(RPO).save(tmp_path / "fresh")
+    seen = []
+    for seed in (2, 2, 3):
+        model = RPO.load(tmp_path / "fresh", short(10.0), target_env=short(), seed=seed)
+        model.learn(1, source_timesteps=60)
+        seen.append(chronological(model.replay_buffer.source)["actions"][:60])
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert not np.array_equal(seen[0], seen[2])
+
+
+def test_steps_of_a_log_are_no_rollout_in_the_target_that_comes_after_it():
+    recorded = small(RPO, short(10.0), short()).learn(40, source_timesteps=0).replay_buffer.target
+    settings = {"policy_kwargs": SMALL_POLICY, "batch_size": 32, "source_steps": 20, "gradient_steps": 1, "seed": 0}
+    few = {"dynamics_kwargs": SMALL_ENSEMBLE, "model_train_freq": 20, "device": "cpu"}
+    model = RPTO("MlpPolicy", short(10.0), target_data=recorded, **settings, **few)
+    model.learn(500, lambda local, _: model.num_timesteps < 200, source_timesteps=0)
+    model.set_target_env(short())
+    updates, steps = model._n_updates, model.source_timesteps
+    model.learn(2, reset_num_timesteps=False)
+    assert model._n_updates - updates == 2
+    assert model.source_timesteps - steps == 40

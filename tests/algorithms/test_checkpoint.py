@@ -520,6 +520,47 @@ def test_a_source_model_that_does_not_fit_is_refused(tmp_path):
         RPTO.from_source(sac, pendulum(), pendulum(12.0), source_data=short.replay_buffer)
 
 
+def test_a_source_model_of_other_observations_is_named_before_anything_is_built():
+    class Split(gym.ObservationWrapper):
+        observation_space = gym.spaces.Dict({"all": gym.spaces.Box(-9, 9, (3,))})
+
+        def observation(self, observation):
+            return {"all": observation}
+
+    sac = SAC("MultiInputPolicy", Split(pendulum()), policy_kwargs=SMALL_POLICY)
+    with pytest.raises(ValueError, match=r"source_model has observation_space Dict\("):
+        RPTO.from_source(sac, pendulum(), pendulum(12.0))
+
+
+def test_a_first_fit_that_was_interrupted_is_made_again(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    model = small(RPTO)
+    with monkeypatch.context() as patch:
+        patch.setattr(type(model.dynamics), "_train_epoch", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(5, source_timesteps=60)
+    assert not model.dynamics.fitted
+    model.save(tmp_path / "m.zip")
+    assert not RPTO.load(tmp_path / "m.zip").dynamics.fitted
+    model.learn(5, reset_num_timesteps=False, source_timesteps=60)
+    assert model.dynamics.fitted
+
+
+def test_a_rule_that_no_checkpoint_could_hold_is_refused():
+    class Robot:
+        def __reduce__(self):
+            raise TypeError("a robot does not pickle")
+
+        def ends(self, observations, actions, next_observations):
+            return observations[:, 0] > 1
+
+    settings = {**SMALL_ENSEMBLE, "termination_fn": Robot().ends}
+    with pytest.raises(ValueError, match=r"dynamics_kwargs\['termination_fn'\] does not pickle \(a robot does not"):
+        small(RPTO, dynamics_kwargs=settings)
+
+
 def test_other_action_bounds_are_pointed_out():
     sac = SAC("MlpPolicy", gym.wrappers.RescaleAction(pendulum(), -1.0, 1.0), policy_kwargs=SMALL_POLICY)
     with pytest.warns(UserWarning, match="another action"):
