@@ -197,7 +197,7 @@ class KeepBest(TransferCallback):
     """
 
     #: what it must be in; learn() checks it, since in a list a callback knows its parent only after it is initialised
-    inside = EvalCallback
+    must_be_inside = EvalCallback
 
     def _init_callback(self) -> None:
         super()._init_callback()

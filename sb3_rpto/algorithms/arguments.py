@@ -332,7 +332,7 @@ def check_callbacks(callback: BaseCallback, target_env: VecEnv | None) -> None:
     :raises ValueError: naming the callback
     """
     for one in _callbacks(callback):
-        inside = getattr(one, "inside", None)
+        inside = getattr(one, "must_be_inside", None)
         if inside is not None and not isinstance(one.parent, inside):
             name = type(one).__name__
             raise ValueError(
