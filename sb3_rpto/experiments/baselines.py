@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_rpto.algorithms import warm
@@ -26,6 +26,7 @@ from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics
 
 #: Gradient steps of each critic that is added to a source model's two.
 CRITIC_STEPS = 2_000
+STEP_BY_STEP = TrainFreq(1, TrainFrequencyUnit.STEP)
 
 
 def fine_tuned_sac(
@@ -33,16 +34,40 @@ def fine_tuned_sac(
 ) -> SAC:
     """SAC-warm: the source's SAC, ready to go on in the target from its first step, with an empty replay buffer.
 
+    It collects step by step, so that a budget is met exactly, with as many updates per step as in the source.
+
     :param source_model: zip of the SAC that was trained in the source
     :param target: the target
     :param seed: of the run
     :param device: to learn on
     :param settings: attributes to change, e.g. ``gradient_steps``
+    :raises ValueError: for another ``train_freq``, or an ``ent_coef`` that is fixed where the source's is learned
     """
-    model = SAC.load(source_model, env=target, device=device, **settings)
+    _check_step_by_step(settings)
+    try:
+        model = SAC.load(source_model, env=target, device=device, **settings)
+    except AttributeError as error:  # of an optimizer of the temperature, in the zip alone or in the model alone
+        if "ent_coef" not in settings:
+            raise
+        raise ValueError(
+            "ent_coef: of source model and settings one fixes the temperature and the other learns it; leave it out"
+        ) from error
     model.set_random_seed(seed)
     model.learning_starts = 0
+    frequency, unit = cast(TrainFreq, model.train_freq)
+    if "gradient_steps" not in settings and model.gradient_steps > 0:
+        in_steps = unit == TrainFrequencyUnit.STEP
+        model.gradient_steps = max(round(model.gradient_steps / frequency), 1) if in_steps else 1
+    model.train_freq = STEP_BY_STEP  # type: ignore[assignment]  # as SB3's own conversion does
     return model
+
+
+def _check_step_by_step(settings: Mapping[str, Any]) -> None:
+    if settings.get("train_freq", 1) not in (1, STEP_BY_STEP):
+        raise ValueError(
+            f"train_freq is {settings['train_freq']!r}, and a budget of target steps is met step by step: give 1, and "
+            "the updates for each step as gradient_steps"
+        )
 
 
 def source_transitions(
@@ -58,7 +83,8 @@ def source_transitions(
     """
     if source_data is not None:
         return load_transitions(source_data), 0
-    recorder = fine_tuned_sac(source_model, source, seed, gradient_steps=0).learn(warm.PHI_0_STEPS)
+    settings: dict[str, Any] = {"gradient_steps": 0, "buffer_size": warm.PHI_0_STEPS}
+    recorder = fine_tuned_sac(source_model, source, seed, **settings).learn(warm.PHI_0_STEPS)
     assert recorder.replay_buffer is not None  # learn() has filled it
     return chronological(recorder.replay_buffer), warm.PHI_0_STEPS
 
@@ -73,6 +99,7 @@ def with_more_critics(
     n_critics: int,
     data: dict[str, np.ndarray],
     device: str = "cpu",
+    **settings: Any,
 ) -> SAC:
     """SAC-warm with more critics than the source model had, as methods with many updates a step use them.
 
@@ -85,15 +112,17 @@ def with_more_critics(
     :param n_critics: how many there shall be, at least as many as there are
     :param data: source transitions
     :param device: to learn on
-    :raises ValueError: for fewer critics than the source model has
+    :param settings: arguments of SAC that win over the source model's
+    :raises ValueError: for fewer critics than the source model has, or another ``train_freq`` than 1
     """
+    _check_step_by_step(settings)
     source = fine_tuned_sac(source_model, target, seed, device)
     old = source.critic.q_networks
     if n_critics < len(old):
         raise ValueError(f"n_critics must be at least the source model's {len(old)}, got {n_critics}")
-    settings = {**warm.carried_arguments(source), "learning_starts": 0, "seed": seed, "device": device}
-    settings["policy_kwargs"] = {**settings["policy_kwargs"], "n_critics": n_critics}
-    model = SAC("MlpPolicy", target, **settings)
+    arguments = {**warm.carried_arguments(source), "learning_starts": 0, "seed": seed, "device": device, **settings}
+    arguments["policy_kwargs"] = {**arguments["policy_kwargs"], "n_critics": n_critics}
+    model = SAC("MlpPolicy", target, **arguments)
     model.actor.load_state_dict(source.actor.state_dict())
     if model.log_ent_coef is not None and source.log_ent_coef is not None:
         model.log_ent_coef.data.copy_(source.log_ent_coef.data)

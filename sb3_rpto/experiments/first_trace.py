@@ -139,7 +139,9 @@ def first_transitions(job: Job, folder: Path) -> Measurements:
 def noisy_log(job: Job, folder: Path) -> Measurements:
     """Runs of the source's stochastic policy in the target, as a robot's log shows them: positions, with noise."""
     agent = SAC.load(source_agent(job.task, folder)[0], device="cpu")
-    env = make_target(job.task, job.shift, job.target)
+    env: gym.Env = make_target(job.task, job.planted, job.target)
+    if job.shift == GUSTS:
+        env = Gusts(env, job.seed)
     robot: Any = env.unwrapped
     columns, rng = columns_of(robot.model), np.random.default_rng(job.seed)
     skip, step = robot.frame_skip, robot.model.opt.timestep

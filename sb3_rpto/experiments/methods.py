@@ -101,9 +101,9 @@ def _sac_warm_high(run: Run, curve: LearningCurve) -> None:
         model = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, **settings)
     else:
         data = run.source_transitions(curve)
-        model = baselines.with_more_critics(run.source_model, run.make_target(), run.seed, n_critics, data, run.device)
-        for name, value in settings.items():
-            setattr(model, name, value)
+        model = baselines.with_more_critics(
+            run.source_model, run.make_target(), run.seed, n_critics, data, run.device, **settings
+        )
     model.learn(run.budget, callback=curve)
 
 

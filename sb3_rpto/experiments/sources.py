@@ -44,8 +44,12 @@ def find(name: str, folder: Path) -> Path | None:
     :param folder: the study's own
     :return: None where neither has it
     """
+    return next(iter(_found(name, folder)), None)
+
+
+def _found(name: str, folder: Path) -> list[Path]:
     given = Path(os.environ.get(FOLDER_VARIABLE, "../shared/sources"))
-    return next((path.resolve() for path in (given / name, folder / name) if path.is_file()), None)
+    return [path.resolve() for path in (given / name, folder / name) if path.is_file()]
 
 
 def source_agent(name: str, make_source: MakeEnv, steps: int, folder: Path, **settings: Any) -> tuple[str, str | None]:
@@ -105,8 +109,7 @@ def reference(name: str, agent: str, make_source: MakeEnv, make_target: MakeEnv,
     :param folder: where it is kept
     """
     file, wanted = f"{name}_oracle.json", {"steps": steps, "agent": digest(agent)}
-    found = find(file, folder)
-    if found is not None:
+    for found in _found(file, folder):
         known: Reference = json.loads(found.read_text(encoding="utf-8"))
         if {key: known.get(key) for key in wanted} == wanted:
             return known

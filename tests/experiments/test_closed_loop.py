@@ -97,7 +97,19 @@ def test_steps_to_a_share_of_the_oracle() -> None:
     # 684 is reached at once by the third seed alone.
     assert (line["median"], line["reached"]) == (500, 3)
     assert study.steps_to_oracle(rows(), {("hopper", "none", 0): 2000.0}).iloc[0]["reached"] == 0
-    assert study.steps_to_oracle(rows(), {("hopper", "none", 1): 1.0}).empty, "of an unknown oracle nothing is said"
+    nothing = study.steps_to_oracle(rows(), {("hopper", "none", 1): 1.0})
+    assert nothing.empty, "of an unknown oracle nothing is said"
+    assert list(nothing.columns) == list(line.index)
+
+
+@pytest.mark.parametrize("runs", [2, 4, 6, 8])
+def test_where_half_of_the_runs_are_there_the_median_is_not(runs: int) -> None:
+    half = pd.concat(
+        [rows().query("seed == 0").assign(seed=i, **{"return": 800.0 if i % 2 else 0.0}) for i in range(runs)]
+    )
+    line = study.steps_to_oracle(half, {("hopper", "none", 0): 760.0}).iloc[0]
+    assert line["reached"] == runs // 2
+    assert line["median"] == np.inf
 
 
 def test_noisy_sensors_are_those_of_the_target_and_the_loop_is_told(

@@ -65,6 +65,13 @@ def test_gusts_push_the_cart_and_nobody_records_them(folder: Path) -> None:
     assert np.abs(a.qpos[:n, 0] - b.qpos[:n, 0]).max() > 5e-3
 
 
+def test_gusts_are_in_a_log_as_well(folder: Path) -> None:
+    still, pushed = (noisy_log(Job("double-pendulum", shift, 0, noise=1e-3), folder) for shift in ("declared", "gusts"))
+    assert any(
+        len(a) != len(b) or np.abs(a.qpos - b.qpos).max() > 5e-3 for a, b in zip(still.episodes, pushed.episodes)
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("shift", "named"), [("undeclared", "coulomb_friction(slider)"), ("none", "")])
 def test_a_trace_is_compared_with_the_truth_and_made_once(

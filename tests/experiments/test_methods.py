@@ -204,6 +204,48 @@ def test_further_critics_agree_with_the_sources_and_are_their_own(source_model: 
         baselines.with_more_critics(source_model, cartpole(), 0, 1, data)
 
 
+def test_further_critics_leave_all_other_settings_to_the_user(source_model: str) -> None:
+    data, _ = baselines.source_transitions(source_model, cartpole(), 0)
+    settings = {"learning_rate": 1e-5, "buffer_size": 500, "ent_coef": 0.1}
+    model = baselines.with_more_critics(source_model, cartpole(), 0, 3, data, **settings)
+    assert model.actor.optimizer.param_groups[0]["lr"] == 1e-5
+    assert model.replay_buffer.buffer_size == 500
+    assert model.ent_coef_optimizer is None
+    assert float(model.ent_coef_tensor) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("train_freq", "gradient_steps", "updates"),
+    [(1, 1, 1), (64, 64, 1), (20, 40, 2), ((1, "episode"), -1, -1), ((2, "episode"), 50, 1)],
+)
+def test_a_fine_tuned_sac_meets_its_budget_step_by_step_whatever_the_source_did(
+    train_freq: Any, gradient_steps: int, updates: int, tmp_path: Path
+) -> None:
+    settings = {"policy_kwargs": SMALL_POLICY, "train_freq": train_freq, "gradient_steps": gradient_steps}
+    SAC("MlpPolicy", cartpole(), **settings, device="cpu").save(tmp_path / "sac.zip")
+    where = target()
+    model = baselines.fine_tuned_sac(tmp_path / "sac.zip", where, 0).learn(30)
+    assert where.steps == model.num_timesteps == 30
+    assert model.gradient_steps == updates
+    assert model._n_updates == 30 * max(updates, 1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [({"train_freq": 2}, "train_freq is 2, .* give 1"), ({"ent_coef": 0.1}, "ent_coef: .* leave it out")],
+)
+def test_settings_that_fine_tuning_cannot_have_are_named(source_model: str, settings: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        baselines.fine_tuned_sac(source_model, cartpole(), 0, **settings)
+
+
+def test_fresh_source_transitions_are_as_many_as_they_cost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(baselines.warm, "PHI_0_STEPS", 90)
+    SAC("MlpPolicy", cartpole(), policy_kwargs=SMALL_POLICY, buffer_size=30, device="cpu").save(tmp_path / "sac.zip")
+    found, spent = baselines.source_transitions(tmp_path / "sac.zip", cartpole(), 0)
+    assert len(found["rewards"]) == spent == 90
+
+
 def test_identify_then_retrain_finds_the_pole_and_trains_in_the_simulator_alone(source_model: str) -> None:
     recorder = baselines.fine_tuned_sac(source_model, cartpole(pole_length=2.0), 0, gradient_steps=0).learn(80)
     source = make_vec_env(cartpole)

@@ -252,6 +252,11 @@ def test_an_oracle_is_the_best_of_a_long_run_and_is_kept(
     assert calls == [("oracle", 500)]
     assert measure(700)["steps"] == 700  # another budget is another oracle
     assert len(calls) == 2
+    (tmp_path / "given").mkdir()
+    (tmp_path / "given" / "x_oracle.json").write_text(json.dumps({**first, "agent": "another"}))
+    monkeypatch.setenv(sources.FOLDER_VARIABLE, str(tmp_path / "given"))
+    assert measure(700)["steps"] == 700
+    assert len(calls) == 2, "one that is given and does not fit hides none that is kept"
 
 
 # --- the command ----------------------------------------------------------------------------------------------------
