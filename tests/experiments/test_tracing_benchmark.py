@@ -140,6 +140,7 @@ def test_library_effects_do_what_the_planted_ones_do(kind):
     made = generate(system, [plant], 3, episodes=5, duration=0.6, rate=250.0, noise=0.0)
     data, effect = made.measurements.episodes, as_effect(system, plant)
     model = mujoco.MjModel.from_xml_string(made.xml)
+    effect.bind(model)
     known = [d.with_values(np.array([made.truth.declared[d.label]])) for d in declare(model, made.declared)]
     commands = np.repeat(np.stack([e.ctrl for e in data]), 8, axis=1)
     commands = np.pad(commands, [(0, 0), (600, 0), (0, 0)])  # the planted chain begins with zeros
