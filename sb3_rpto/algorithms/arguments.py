@@ -5,17 +5,14 @@ from __future__ import annotations
 import inspect
 import math
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms.bookkeeping import TwoWorlds
-from sb3_rpto.algorithms.worlds import members
 from sb3_rpto.dynamics.factory import BACKENDS
 from sb3_rpto.dynamics.weights import WEIGHTINGS
 from sb3_rpto.effects import Declared, Effect
@@ -322,36 +319,6 @@ def _first_trace(model: TwoWorlds, loop: LoopCloser) -> int:
     """After how many target steps the first trace is made: with enough of them, at a fit; 0 where it was."""
     wait, done = loop.first_comes_after(model), model._since_fit
     return max(wait, 0) and -(-(wait + done) // model.model_train_freq) * model.model_train_freq - done
-
-
-def check_callbacks(callback: BaseCallback, target_env: VecEnv | None) -> None:
-    """Refuse a callback that evaluates in the target that D_target is collected from, or is in the wrong place.
-
-    The steps of the former would be counted nowhere, and the episode under way would jump.
-
-    :raises ValueError: naming the callback
-    """
-    for one in _callbacks(callback):
-        inside = getattr(one, "must_be_inside", None)
-        if inside is not None and not isinstance(one.parent, inside):
-            name = type(one).__name__
-            raise ValueError(
-                f"{name} works inside {inside.__name__}: {inside.__name__}(eval_env, callback_on_new_best={name}())"
-            )
-        evaluated = getattr(one, "eval_env", None)
-        if isinstance(evaluated, VecEnv) and target_env is not None and members(evaluated) & members(target_env):
-            raise ValueError(
-                f"{type(one).__name__} evaluates in target_env itself, so the episode that D_target is collected from "
-                "would jump; give it an environment of its own"
-            )
-
-
-def _callbacks(callback: BaseCallback) -> Iterator[BaseCallback]:
-    yield callback
-    parts = [*getattr(callback, "callbacks", []), getattr(callback, "callback", None)]
-    for part in parts:
-        if isinstance(part, BaseCallback):
-            yield from _callbacks(part)
 
 
 def _is_number(value: Any) -> bool:

@@ -10,18 +10,14 @@ from typing import TYPE_CHECKING, Any, cast
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-    CallbackList,
-    ProgressBarCallback,
-    StopTrainingOnMaxEpisodes,
-)
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import HumanOutputFormat, Logger
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
+from sb3_rpto.algorithms.listeners import count_in_target
 from sb3_rpto.algorithms.machine import check_machine, check_simulator, doubt, doubt_rules
 from sb3_rpto.algorithms.snapshots import PolicySnapshots
 from sb3_rpto.algorithms.source import SourceWorld
@@ -292,11 +288,7 @@ class TwoWorlds(PolicySnapshots):
         callbacks = super()._init_callback(callback, progress_bar)
         if self.best_by != judged_by:  # by a callback, or no longer: the two measures cannot be compared
             self.best_mean_reward = -np.inf
-        for item in _flatten(callbacks):
-            if isinstance(item, ProgressBarCallback):
-                item.__class__ = TargetProgressBar
-            elif isinstance(item, StopTrainingOnMaxEpisodes) and self.target_env is not None:
-                item._total_max_episodes = item.max_episodes * self.target_env.num_envs
+        count_in_target(callbacks, self.target_env)
         return callbacks
 
     def _watch_for_null_shift(self) -> None:
@@ -434,23 +426,8 @@ class EpisodesWithinBudget:
         return self._n_steps if self._model._episode_num < self._last_episode else 0
 
 
-class TargetProgressBar(ProgressBarCallback):
-    """SB3's progress bar, advancing by the steps that count: those of ``num_timesteps``."""
-
-    def _on_step(self) -> bool:
-        self.pbar.update(self.model.num_timesteps - self.model._num_timesteps_at_start - self.pbar.n)
-        return True
-
-
 def _make_room_for_names(logger: Logger) -> None:
     """SB3's table cuts keys at 36 characters and refuses two that are the same then, as names of effects may be."""
     for output in logger.output_formats:
         if isinstance(output, HumanOutputFormat):
             output.max_length = max(output.max_length, LONGEST_KEY)
-
-
-def _flatten(callback: BaseCallback) -> list[BaseCallback]:
-    """The single callbacks in nested lists."""
-    if isinstance(callback, CallbackList):
-        return [item for child in callback.callbacks for item in _flatten(child)]
-    return [callback]

@@ -20,6 +20,7 @@ from stable_baselines3.sac.policies import SACPolicy
 from sb3_rpto.algorithms import arguments, checkpoint, dynamics_arguments, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.closing import LoopCloser, trace_log
+from sb3_rpto.algorithms.listeners import check_callbacks
 from sb3_rpto.algorithms.looping import Looping
 from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_world
 from sb3_rpto.algorithms.worlds import check_environment, check_spaces, find_ledger
@@ -351,7 +352,7 @@ class TransferAlgorithm(Looping):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
-        arguments.check_callbacks(callback, self.target_env)
+        check_callbacks(callback, self.target_env)
         self._source_world = self._source_world or self._make_source_world()
         trace_log(self)  # first of all: the log may be refused
         if not self._warm:
