@@ -183,10 +183,7 @@ def _picklable(config: dict[str, Any] | None) -> dict[str, Any] | None:
 def capture(model: Resumable) -> dict[str, Any]:
     """Where the two worlds and the random streams stand, as plain data."""
     return {
-        "random": random.getstate(),
-        "numpy": np.random.get_state(),
-        "torch": th.get_rng_state(),
-        "actions": model.action_space.np_random.bit_generator.state,
+        **_streams(model),
         "source": None if model.env is None else save_state(model.env),
         "target": None if model.target_env is None else save_state(find_ledger(model.target_env).venv),
         "source_world": None if model._source_world is None else model._source_world.get_state(),
@@ -195,6 +192,16 @@ def capture(model: Resumable) -> dict[str, Any]:
         "unstored_step": _unstored_step(model),
         "warm": model._warm,
         "learner": model.snapshots.get("learner"),
+    }
+
+
+def _streams(model: Resumable) -> dict[str, Any]:
+    return {
+        "random": random.getstate(),
+        "numpy": np.random.get_state(),
+        "torch": th.get_rng_state(),
+        "cuda": th.cuda.get_rng_state(model.device) if model.device.type == "cuda" else None,
+        "actions": model.action_space.np_random.bit_generator.state,
     }
 
 
@@ -249,6 +256,8 @@ def _restore_streams(model: Resumable, state: dict[str, Any]) -> None:
     random.setstate(state["random"])
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
+    if model.device.type == "cuda" and state.get("cuda") is not None:  # else it was saved on another kind of device
+        th.cuda.set_rng_state(state["cuda"], model.device)
     model.action_space.np_random.bit_generator.state = state["actions"]
 
 

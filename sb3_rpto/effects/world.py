@@ -6,6 +6,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from sb3_rpto.cores import cores
+
 #: Fields whose change asks for mj_setConst.
 _DERIVING = frozenset(mujoco.MjModel._setconst_inputs)
 
@@ -111,11 +113,11 @@ class World(ABC):
 
 
 class BatchWorld(World):
-    """``n`` simulations on the threads of a :class:`mujoco.batch.Batch`."""
+    """``n`` simulations on the threads of a :class:`mujoco.batch.Batch`; 0: one for each of :func:`cores`."""
 
     def __init__(self, model: mujoco.MjModel, n: int, nthread: int = 0) -> None:
         super().__init__(model, n)
-        self.batch = Batch(model, n, nthread)
+        self.batch = Batch(model, n, nthread or cores())
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.ctrl, self.time = self.batch.bind("ctrl"), self.batch.bind("time")
         self.actuation = self.batch.bind("qfrc_actuator")

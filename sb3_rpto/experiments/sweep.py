@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import gymnasium as gym
 import torch as th
 
+from sb3_rpto.cores import cores
 from sb3_rpto.envs.tasks import env_id, make_shift
 from sb3_rpto.experiments.ablation import ABLATED
 from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
@@ -85,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _workers(given: int | None) -> int:
     if given is not None and given < 1:
         raise ValueError(f"workers is {given}; give 1 or more, or nothing for one a core")
-    return given or os.cpu_count() or 1
+    return given or cores()
 
 
 # --- many runs ------------------------------------------------------------------------------------------------------

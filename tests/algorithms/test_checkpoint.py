@@ -137,6 +137,29 @@ def test_resuming_equals_not_having_stopped(case, tmp_path):
     assert_same(unbroken, resumed)
 
 
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs CUDA")
+def test_resuming_on_a_gpu_draws_the_numbers_that_were_next(tmp_path):
+    model = small(RPTO, device="cuda").learn(30, source_timesteps=0)
+    model.save(tmp_path / "model")
+    expected = th.rand(5, device="cuda")
+    resumed = RPTO.load(tmp_path / "model", env=pendulum(), target_env=pendulum(12.0), device="cuda")
+    resumed.replay_buffer = model.replay_buffer
+    drawn = []
+    resumed.learn(1, NextNumbers(drawn), reset_num_timesteps=False)
+    assert th.equal(drawn[0], expected)
+
+
+class NextNumbers(BaseCallback):
+    """What the GPU's stream gives as learning begins."""
+
+    def __init__(self, drawn):
+        super().__init__()
+        self.drawn = drawn
+
+    def _on_training_start(self):
+        self.drawn.append(th.rand(5, device="cuda"))
+
+
 @pytest.mark.parametrize("cls", ALGORITHMS)
 def test_saving_a_loaded_model_again_keeps_where_it_stood(cls, tmp_path):
     def resumed(name):
@@ -169,7 +192,7 @@ def test_a_world_that_is_built_otherwise_begins_a_new_episode(tmp_path):
 def test_a_checkpoint_alone_can_predict(cls, tmp_path):
     model = small(cls).learn(60, source_timesteps=0)
     model.save(tmp_path / "model.zip")
-    loaded = cls.load(tmp_path / "model.zip")
+    loaded = cls.load(tmp_path / "model.zip", device="cpu")
     observations = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
     np.testing.assert_array_equal(
         model.predict(observations, deterministic=True)[0], loaded.predict(observations, deterministic=True)[0]
@@ -187,7 +210,7 @@ def test_a_checkpoint_alone_can_predict(cls, tmp_path):
 def test_the_dynamics_come_back_whole(tmp_path):
     model = small(RPTO).learn(120, source_timesteps=0)
     model.save(tmp_path / "model.zip")
-    loaded = RPTO.load(tmp_path / "model.zip")
+    loaded = RPTO.load(tmp_path / "model.zip", device="cpu")
     before, after = model.dynamics.state_dict(), loaded.dynamics.state_dict()
     assert before.keys() == after.keys()
     for name in before:

@@ -78,7 +78,7 @@ def test_it_resumes_where_a_checkpoint_left_it(tmp_path):
     half = small(MBPO).learn(30, source_timesteps=0)
     half.save(tmp_path / "m.zip")
     half.save_replay_buffer(tmp_path / "b.pkl")
-    resumed = MBPO.load(tmp_path / "m.zip", env=pendulum(), target_env=pendulum(12.0))
+    resumed = MBPO.load(tmp_path / "m.zip", env=pendulum(), target_env=pendulum(12.0), device="cpu")
     resumed.load_replay_buffer(tmp_path / "b.pkl")
     resumed.learn(30, reset_num_timesteps=False)
     assert_same_worlds(whole, resumed)

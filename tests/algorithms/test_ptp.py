@@ -140,7 +140,7 @@ def test_the_network_is_fitted_to_the_models_errors_on_real_data(monkeypatch):
 def test_a_checkpoint_keeps_the_error_network(tmp_path):
     model = small(PTP, error_steps=5, model_train_freq=30).learn(30, source_timesteps=0)
     model.save(tmp_path / "m.zip")
-    loaded = PTP.load(tmp_path / "m.zip", env=pendulum(), target_env=pendulum(12.0))
+    loaded = PTP.load(tmp_path / "m.zip", env=pendulum(), target_env=pendulum(12.0), device="cpu")
     for name, value in model.errors.state_dict().items():
         assert th.equal(value, loaded.errors.state_dict()[name]), name
     assert loaded.errors.optimizer.state_dict()["state"]

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_rpto.cores import cores
 from sb3_rpto.effects import Effect
 from sb3_rpto.experiments import provenance
 from sb3_rpto.experiments.tracing_benchmark.design import Case, design
@@ -82,7 +83,7 @@ def run(
     pending = [case for case in cases if not resume or stored(folder, case) is None]
     # In mixed order an unfinished run is a fair sample, and its time left an honest guess.
     random.Random(0).shuffle(pending)
-    made_by, count = provenance.commit(), min(workers or os.cpu_count() or 1, max(1, len(pending)))
+    made_by, count = provenance.commit(), min(workers or cores(), max(1, len(pending)))
     say = _Progress(len(pending))
     if count == 1:
         for case in pending:
