@@ -62,6 +62,7 @@ def test_trace_prints_the_report_and_writes_the_folder(files: Path, capsys: pyte
     assert (files / "out" / "model.xml").is_file()
 
 
+@pytest.mark.slow
 def test_effects_are_known_from_a_file(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     known = files / "known.json"
     known.write_text(json.dumps([CoulombFriction("hinge", level=0.05).to_json()]))
@@ -91,6 +92,7 @@ def test_bad_input_leaves_no_folder(files: Path, tmp_path: Path, capsys: pytest.
     assert (tmp_path / "mine").exists()
 
 
+@pytest.mark.slow
 def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(files, "--quiet", "--format", "csv", "--horizon", "0.15") == 0
     captured = capsys.readouterr()

@@ -39,6 +39,7 @@ def run(module: ModuleType, monkeypatch: pytest.MonkeyPatch, out: Path, *argumen
     module.main()
 
 
+@pytest.mark.slow
 def test_trace_robot_names_what_is_in_the_robot(trace_robot, monkeypatch, tmp_path, capsys):
     label, effect, _ = trace_robot.robot(seed=0)[3].open()
     assert label == "actuator_lag(motor)"

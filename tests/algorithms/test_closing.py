@@ -117,6 +117,7 @@ def test_a_target_that_queues_actions_is_met_from_the_first_step_of_an_episode_o
     assert dynamics(again).error(data) == dynamics(made).error(data)
 
 
+@pytest.mark.slow
 def test_a_trace_is_logged_before_any_episode_ends(soon: None, tmp_path: Path) -> None:
     made = filled([])
     made.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))
@@ -144,6 +145,7 @@ def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPat
         made.loop.close(made, dynamics(made))
 
 
+@pytest.mark.slow
 def test_an_empty_list_traces_the_declared_numbers_alone(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     began = []
     monkeypatch.setattr(Rounds, "learn", lambda self, made, loop: began.append(made.num_timesteps))
@@ -243,6 +245,7 @@ def test_transitions_that_hold_no_window_end_no_run(soon: None, monkeypatch: pyt
     assert made.loop.due(made, dynamics(made))
 
 
+@pytest.mark.slow
 def test_transitions_that_were_not_traced_are_tried_again_after_a_settled_trace(
     soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -473,6 +476,7 @@ def test_instability_is_seen(seen: int) -> None:
     assert not stays_finite(dynamics(made), data, made.env)
 
 
+@pytest.mark.slow
 def test_another_trace_is_due_when_new_transitions_are_no_longer_predicted(
     soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -600,6 +604,7 @@ def test_learning_in_the_corrected_simulator_goes_on_where_it_was_interrupted(
     np.testing.assert_array_equal(begun[0], weights(made))
 
 
+@pytest.mark.slow
 def test_encoder_zeros_that_differ_by_run_are_taken_off_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     runs = tuple(dict.fromkeys(episode.run for episode in measured.episodes))
@@ -675,6 +680,7 @@ def test_what_to_look_for_is_told_by_kinds(kind: object) -> None:
         model([], close_loop=[kind])
 
 
+@pytest.mark.slow
 def test_recorded_transitions_that_are_few_are_traced_as_they_become_no_more() -> None:
     recorded = filled(friction()).replay_buffer
     made = model([], target_env=None, target_data=recorded, model_train_freq=20)
@@ -1087,6 +1093,7 @@ def test_many_steps_are_taken_for_each_update_where_the_simulator_accounts_for_a
     assert made._n_updates - before == updates
 
 
+@pytest.mark.slow
 def test_after_a_log_the_best_policy_is_left_and_the_last_one_goes_on_learning(monkeypatch: pytest.MonkeyPatch) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)
@@ -1341,6 +1348,7 @@ def test_what_is_owed_is_owed_to_a_run_that_counts_anew(monkeypatch: pytest.Monk
     assert (made._n_updates - updates, made._owed) == (40, 0)
 
 
+@pytest.mark.slow
 def test_a_target_after_its_log_begins_anew(soon: None) -> None:
     measured = Measurements.from_replay(filled(friction()).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured).learn(40, source_timesteps=0)

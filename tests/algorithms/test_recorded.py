@@ -330,6 +330,7 @@ def test_a_model_saved_before_its_trace_asks_for_the_log(tmp_path: Path) -> None
         loaded.learn(20, source_timesteps=0)
 
 
+@pytest.mark.slow
 def test_a_log_that_corrects_the_simulator_alone_is_not_asked_for_again(tmp_path: Path) -> None:
     measured = log(pushed=True)
     fallen = [replace(episode, qpos=episode.qpos + np.array([0, 0.6])) for episode in measured.episodes]

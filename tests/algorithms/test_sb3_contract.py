@@ -36,7 +36,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 from stable_baselines3.sac.policies import SACPolicy
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_rpto import RPO
+from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
@@ -44,8 +44,10 @@ from sb3_rpto.algorithms.transfer import TransferAlgorithm
 EPISODE = 10
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
-every_class = pytest.mark.parametrize("cls", [SAC, *ALGORITHMS])
-ours = pytest.mark.parametrize("cls", ALGORITHMS)
+#: RTO runs the code that RPTO runs, less RPO's term.
+OURS = [RPO, pytest.param(RTO, marks=pytest.mark.slow), RPTO]
+every_class = pytest.mark.parametrize("cls", [SAC, *OURS])
+ours = pytest.mark.parametrize("cls", OURS)
 pytestmark = pytest.mark.filterwarnings("ignore:EnsembleDynamics learns terminations")
 
 
@@ -1171,7 +1173,7 @@ def test_files_of_another_algorithm_are_refused_in_words(tmp_path):
     for cls in ALGORITHMS:
         with pytest.raises(ValueError, match="from_source"):
             cls.load(tmp_path / "sac", env=Drift(), target_env=windy())
-    for saved, loading in ((RPO, ALGORITHMS[2]), (ALGORITHMS[2], RPO)):
+    for saved, loading in ((RPO, RPTO), (RPTO, RPO)):
         learn(build(saved), 5).save(tmp_path / "model")
         with pytest.raises(ValueError, match=saved.__name__):
             loading.load(tmp_path / "model")

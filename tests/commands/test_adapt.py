@@ -70,6 +70,7 @@ def test_a_log_becomes_a_report_a_simulator_and_a_policy(given: Path, tmp_path: 
     assert "holds a run with seed=0" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_as_if_it_had_not_been(given: Path, tmp_path: Path, monkeypatch) -> None:
     assert adapt(given, tmp_path / "whole") == 0
     add = Progress._add_row

@@ -89,6 +89,7 @@ def test_a_trace_is_compared_with_the_truth_and_made_once(
     assert run(job, folder) == {**asdict(job), "verdict": "kept"}
 
 
+@pytest.mark.slow
 def test_numbers_that_nobody_declared_are_compared_as_effects(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(first_trace, "FIRST", 120)
     row = run(Job("double-pendulum", "declared", 0, declared=False), folder)

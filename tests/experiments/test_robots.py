@@ -63,6 +63,7 @@ def test_gusts_push_at_a_motor_by_a_share_of_its_force() -> None:
     assert hinge == 0.0
 
 
+@pytest.mark.slow
 def test_what_is_put_in_is_found_and_the_trace_is_kept(tmp_path: Path) -> None:
     job = Job("InvertedPendulum-v5", "coulomb_friction")
     row = run(job, tmp_path)

@@ -25,6 +25,7 @@ def expected(made: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, list[floa
     return stored(made)
 
 
+@pytest.mark.slow
 def test_two_processes_find_what_one_finds(
     tmp_path: Path, expected: dict[str, list[float]], capsys: pytest.CaptureFixture[str]
 ) -> None:

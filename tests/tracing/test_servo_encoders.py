@@ -51,5 +51,6 @@ def test_the_zero_is_found_and_not_what_it_resembles() -> None:
     assert after[0.5] < 0.2 * before[0.5]
 
 
+@pytest.mark.slow
 def test_a_right_zero_is_no_finding() -> None:
     assert traced(0.0).verdict == "complete"

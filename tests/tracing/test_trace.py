@@ -190,6 +190,7 @@ def test_what_lies_outside_the_library_is_not_explained() -> None:
     assert not report.adequacy_before.adequate
 
 
+@pytest.mark.slow
 def test_of_what_looks_alike_one_is_tried_for_all() -> None:
     p = planted(("wind_gusts", "large"))
     late, slow = trace(p.xml, p.measurements, p.declared, candidates=["command_delay", "actuator_lag"]).candidates

@@ -130,6 +130,7 @@ def test_of_a_run_that_is_too_short_for_a_window_no_zero_is_said() -> None:
     np.testing.assert_allclose(differences(report, 1.0), 0.0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_without_a_bias_among_the_candidates_none_are_looked_for() -> None:
     report = briefly(PENDULUM, shifted(runs(), ZEROS), [], ["spring"])
     assert report.zeros is None
