@@ -37,11 +37,14 @@ def versions() -> dict[str, str | None]:
 def commit() -> str | None:
     """The commit of the package's checkout, marked where it was changed; None outside of one.
 
+    An installed package that lies in somebody's checkout, as a virtual environment does, is no part of it.
     It is looked up once in a process, whose code stays what it was when the checkout moves on: ask early.
     """
-    command = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
+    tracked = ["git", "ls-files", "--error-unmatch", Path(__file__).name]
+    describe = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
     try:
-        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
+        for command in (tracked, describe):
+            done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
     return done.stdout.strip() or None
