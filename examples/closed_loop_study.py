@@ -68,7 +68,7 @@ def main() -> None:
         for future in tqdm([*bests, *futures], desc="runs"):
             future.result()
 
-    rows, oracles = study.collected(a.runs), study.oracles(a.runs)
+    rows, oracles = study.collected(a.runs, a.sensors), study.oracles(a.runs)
     if rows.empty:
         parser.error(f"--runs: {a.runs} holds no run; ask for some by --seeds")
     rows.to_csv(out / "runs.csv", index=False)

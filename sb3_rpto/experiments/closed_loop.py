@@ -318,11 +318,12 @@ def oracles(folder: Path) -> dict[tuple[str, str, int], float]:
     return {place: float(json.loads(p.read_text())["return"]) for place, p in files.items() if p.exists()}
 
 
-def collected(folder: Path) -> pd.DataFrame:
-    """All rows of all finished runs."""
+def collected(folder: Path, sensors: float = 0.0) -> pd.DataFrame:
+    """All rows of all finished runs whose targets were observed with this noise, see :class:`Job`."""
     names = {m.replace(" ", "-").replace(",", "") for m in METHODS}
     files = [p for p in sorted(folder.glob("*.json")) if any(f"_{m}_" in p.name for m in names)]
-    return pd.DataFrame([row for p in files for row in json.loads(p.read_text())])
+    rows = [row for p in files for row in json.loads(p.read_text())]
+    return pd.DataFrame([row for row in rows if row.get("sensors", 0.0) == sensors])
 
 
 def summary(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float]) -> pd.DataFrame:

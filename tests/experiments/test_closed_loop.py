@@ -141,6 +141,15 @@ def test_a_run_says_which_commit_made_it(tmp_path: Path, monkeypatch: pytest.Mon
     assert (row["commit"], row["return"], row["target"]) == ("0123abc", 1.0, 1)
 
 
+def test_exact_and_noisy_runs_of_one_folder_are_kept_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study, "source_agent", lambda *_: ("agent", None))
+    monkeypatch.setattr(study, "transfer", lambda *_, **__: [{"return": 1.0}])
+    for sensors in (0.0, 0.001):
+        study.run(study.Job("double-pendulum", "none", 1, "zero-shot", 0, sensors), tmp_path)
+    for sensors in (0.0, 0.001):
+        assert study.collected(tmp_path, sensors)["sensors"].tolist() == [sensors]
+
+
 def test_a_run_of_a_smaller_budget_is_not_taken_for_a_longer_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
