@@ -125,8 +125,15 @@ def list_of_names(declared: Sequence[str]) -> tuple[str, ...]:
             "declared must be a list of names, not a mapping; bounds are part of a name: 'pole.length=0.1:1'"
         )
     if not isinstance(declared, Sequence) or not all(isinstance(name, str) for name in declared):
-        raise TypeError(f"declared must be a list of names, not {declared!r}; write [] for none")
+        remedy = (
+            "in YAML put a name that begins with '?' in quotes" if _holds_mapping(declared) else "write [] for none"
+        )
+        raise TypeError(f"declared must be a list of names, not {declared!r}; {remedy}")
     return tuple(declared)
+
+
+def _holds_mapping(declared: Any) -> bool:
+    return isinstance(declared, Sequence) and any(isinstance(name, Mapping) for name in declared)
 
 
 def check_names(cls: type, passed: Collection[str]) -> None:

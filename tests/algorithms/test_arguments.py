@@ -151,6 +151,7 @@ def test_a_single_declared_name_does_not_come_apart_into_letters():
     [
         ({"pole.length": (0.1, 1.0)}, "not a mapping; bounds are part of a name"),
         ([1], r"not \[1\]"),
+        ([{"pole.length": None}], "not .*in YAML put a name that begins with '\\?' in quotes"),
         (None, "not None"),
     ],
 )
