@@ -1,9 +1,18 @@
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
 from sb3_rpto.experiments.planting import KINDS, SYSTEMS, generate
-from sb3_rpto.experiments.planting.plants import CoulombFriction, PositionFriction
+from sb3_rpto.experiments.planting.plants import (
+    CommandDelay,
+    CoulombFriction,
+    GravityTilt,
+    Payload,
+    PositionFriction,
+    Spring,
+)
 from sb3_rpto.experiments.planting.simulation import Simulation
 
 SHORT = {"episodes": 4, "duration": 0.8}
@@ -161,8 +170,23 @@ def test_halving_the_step_changes_little_with_friction_in_every_joint():
         ({"noise": -1.0}, "noise"),
         ({"duration": 0.01}, "duration"),
         ({"episodes": 0}, "episodes"),
+        ({"effects": [Spring(5, 0.1)]}, r"spring is at joint 5 of pendulum; it acts at \[0\]"),
+        ({"system": "cartpole", "effects": [CommandDelay(1, 0.02)]}, r"command_delay is at joint 1 of cartpole"),
     ],
 )
 def test_bad_settings_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         generate(**{"system": "pendulum", "effects": None, "seed": 0} | change)
+
+
+def test_what_is_planted_is_added_to_what_the_machine_has():
+    tilted, loaded = replace(SYSTEMS["pendulum"], tilt=0.2), replace(SYSTEMS["pendulum"], payload=0.3)
+    for system, plant in ((tilted, GravityTilt(0, 0.0)), (loaded, Payload(0, 0.0))):
+        null, plain = (generate(system, effects, 0, episodes=1, duration=0.5) for effects in ([plant], None))
+        np.testing.assert_array_equal(null.truth.qpos, plain.truth.qpos)
+
+
+def test_numbers_of_numpy_are_written_as_numbers():
+    system = SYSTEMS["pendulum"].with_declared({"pole.mass": np.float64(0.5)})
+    model = mujoco.MjModel.from_xml_string(replace(system, payload=np.float64(0.1)).xml)
+    assert model.body("pole").mass[0] == 0.5

@@ -130,6 +130,20 @@ def test_the_tracers_steps_are_those_of_the_plain_batch():
     assert np.ptp(ours) > 1
 
 
+def test_the_columns_of_a_fit_are_those_of_models_of_their_own():
+    ours, plain = (cases.columns(3).variants[name]() for name in ("ours", "a compilation a column"))
+    np.testing.assert_allclose(ours, plain, atol=1e-9)
+    assert (
+        np.abs(np.diff(plain.reshape(-1, 3, plain.shape[1]), axis=0)).max(axis=(1, 2)).min() > 1e-6
+    )  # a column changes something
+
+
+def test_the_floor_of_a_fit_counts_the_batches_that_it_makes():
+    case = cases.ensemble_training("cpu", 16, members=2, rows=700)
+    (rows,) = {rows for _, rows, n_in, _ in case.floor if n_in == cases.OBSERVATION + ACTION}
+    assert 3 * rows == pytest.approx(0.8 * 700, abs=3)  # three batches of at most 256
+
+
 def test_the_command_writes_figures_and_manifest(tmp_path, monkeypatch):
     monkeypatch.setattr(speed, "_cases", lambda *_: [cases.columns(2)])
     monkeypatch.setattr(

@@ -55,7 +55,10 @@ def sinusoids(style: Style, t: np.ndarray, rng: np.random.Generator) -> np.ndarr
 
 
 def filtered_steps(style: Style, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Random levels in [-1, 1] at times ``t`` (T,), each held for about half a period, reached smoothly."""
+    """Random levels at times ``t`` (T,), each held for about half a period, reached smoothly.
+
+    They begin at 0 and lie in [-2, 2]: steps between levels in [-1, 1], less the first level.
+    """
     n = int(2 * t[-1] * style.fastest) + 2
     at = np.cumsum(rng.uniform(0.5, 1.5, n)) / (2 * style.fastest)
     jumps = np.diff(rng.uniform(-1, 1, n + 1))

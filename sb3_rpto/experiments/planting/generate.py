@@ -8,7 +8,7 @@ import numpy as np
 from sb3_rpto.experiments.planting.excitation import Excitation
 from sb3_rpto.experiments.planting.plants import Plant
 from sb3_rpto.experiments.planting.simulation import Simulation
-from sb3_rpto.experiments.planting.sizes import KINDS, OF_THE_MACHINE, OF_THE_MOTOR, draw
+from sb3_rpto.experiments.planting.sizes import KINDS, OF_THE_MACHINE, OF_THE_MOTOR, draw, joints_for
 from sb3_rpto.experiments.planting.systems import SYSTEMS, System
 from sb3_rpto.tracing import Measurements
 
@@ -108,6 +108,11 @@ def generate(
     kinds = [plant.kind for plant in plants]
     if len(set(kinds)) < len(kinds):
         raise ValueError(f"effects are {kinds}; plant each kind once")
+    for plant in plants:
+        if plant.kind not in OF_THE_MACHINE and plant.joint not in joints_for(system, plant.kind):
+            raise ValueError(
+                f"{plant.kind} is at joint {plant.joint} of {system.name}; it acts at {joints_for(system, plant.kind)}"
+            )
     plants.sort(key=lambda plant: list(KINDS).index(plant.kind))
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(6)]
     for_declared, for_times, for_excitation, for_noise, for_effects, for_zeros = streams

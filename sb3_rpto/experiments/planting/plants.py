@@ -172,24 +172,24 @@ class Spring(Plant):
 
 @dataclass
 class GravityTilt(Plant):
-    """Gravity becomes g (sin ``angle``, 0, -cos ``angle``)."""
+    """Gravity becomes g (sin ``angle``, 0, -cos ``angle``), from where the machine has it."""
 
     angle: float = 0.0
     kind = "gravity_tilt"
 
     def body(self, system: System) -> System:
-        return replace(system, tilt=self.angle)
+        return replace(system, tilt=system.tilt + self.angle)
 
 
 @dataclass
 class Payload(Plant):
-    """A point ``mass`` at the end of the last link."""
+    """A point ``mass`` at the end of the last link, beside what it carries."""
 
     mass: float = 0.0
     kind = "payload"
 
     def body(self, system: System) -> System:
-        return replace(system, payload=self.mass)
+        return replace(system, payload=system.payload + self.mass)
 
 
 @dataclass

@@ -29,6 +29,16 @@ OF_THE_MACHINE = {"gravity_tilt", "payload"}
 OF_A_TURN = {"torque_ripple", "position_friction"}
 
 
+def joints_for(system: System, kind: str) -> list[int]:
+    """Joints at which an effect acts, whether or not it can be identified there; all for one of the whole machine."""
+    joints = list(range(len(system.links)))
+    if kind in OF_THE_MOTOR:
+        joints = [j for j in joints if j in system.driven]
+    if kind in OF_A_TURN:
+        joints = [j for j in joints if system.links[j].hinge]
+    return joints
+
+
 def places(system: System, kind: str) -> list[int]:
     """Joints at which an effect is possible and, together with what is declared, identifiable in principle.
 
@@ -42,13 +52,9 @@ def places(system: System, kind: str) -> list[int]:
     """
     if kind not in KINDS:
         raise ValueError(f"kind is {kind!r}; use one of {', '.join(KINDS)}")
-    joints = list(range(len(system.links)))
+    joints = joints_for(system, kind)
     if kind in OF_THE_MACHINE:
         return joints[-1:]
-    if kind in OF_THE_MOTOR:
-        joints = [j for j in joints if j in system.driven]
-    if kind in OF_A_TURN:
-        joints = [j for j in joints if system.links[j].hinge]
     if kind == "sensor_bias":
         joints = [j for j in joints if j > 0 or (system.links[j].hinge and system.vertical)]
     if kind == "sensor_delay" and len(joints) == 1:
@@ -110,7 +116,10 @@ def _ripple(system: System, j: int, rng: np.random.Generator, size: float) -> di
 
 
 def _flexible(system: System, j: int, rng: np.random.Generator, size: float) -> dict[str, float]:
-    """A rotor of 0.2 of the joint's inertia on a spring: 4 to 5 Hz, lower when large, damped by 5 %."""
+    """A rotor of 0.2 of the joint's inertia on a spring: 4 to 5 Hz, lower when large, damped by 5 %.
+
+    So with the other joints held; free ones make it faster.
+    """
     inertia = _inertia(system, j)
     rotor = 0.2 * inertia
     reduced = rotor * inertia / (rotor + inertia)

@@ -110,8 +110,8 @@ class System:
         links = (
             replace(
                 link,
-                damping=values.get(f"{link.joint}.damping", link.damping),
-                mass=values.get(f"{link.body}.mass", link.mass),
+                damping=float(values.get(f"{link.joint}.damping", link.damping)),
+                mass=float(values.get(f"{link.body}.mass", link.mass)),
             )
             for link in self.links
         )
@@ -226,7 +226,7 @@ class System:
                 if i == len(self.links) - 1 and self.payload:
                     body = (
                         f'<body name="payload" pos="{end}">'
-                        f'<inertial pos="0 0 0" mass="{self.payload!r}" diaginertia="1e-12 1e-12 1e-12"/></body>'
+                        f'<inertial pos="0 0 0" mass="{float(self.payload)!r}" diaginertia="1e-12 1e-12 1e-12"/></body>'
                     )
             else:
                 inertia, middle = [0.01, 0.01, 0.01], "0 0 0"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -24,6 +25,7 @@ from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
 from sb3_rpto.dynamics.products import fast_products
 from sb3_rpto.effects import Simulation, declare
+from sb3_rpto.effects.carry import correct
 from sb3_rpto.effects.friction import AsymmetricDamping
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.experiments.planting.systems import SYSTEMS
@@ -149,8 +151,10 @@ def ensemble_training(device: str, steps: int, members: int = 7, rows: int = 5_0
     }
     shapes: Shapes = Counter()
     sizes = [OBSERVATION + ACTION, *WIDE, 2 * (OBSERVATION + 1)]
-    _forward(shapes, sizes, BATCH, steps, members)
-    _backward(shapes, sizes, BATCH, steps, weights=True, inputs=False, n=members)
+    n = len(trained[EnsembleDynamics].inputs)
+    batch = round(n / math.ceil(n / BATCH))  # an epoch's are alike
+    _forward(shapes, sizes, batch, steps, members)
+    _backward(shapes, sizes, batch, steps, weights=True, inputs=False, n=members)
     return Case("ensemble training", "ms/step", steps, variants, "loop over members", shapes)
 
 
@@ -216,7 +220,10 @@ def _briefly(fit: Callable[..., Any], data: Transitions, weights: Any = None, ma
 
 
 def columns(transitions: int) -> Case:
-    """Finite-difference columns of the physical fit, all in one batch, against a recompiled model for each."""
+    """Finite-difference columns of the physical fit, all in one batch on all threads, against a model for each, on one.
+
+    Variants return the positions after a step of the policy, (columns · transitions, nq).
+    """
     env = gym.make("HalfCheetah-v5")
     model, skip = env.unwrapped.model, env.unwrapped.frame_skip  # type: ignore[attr-defined]
     spec = mujoco.MjSpec.from_file(env.unwrapped.fullpath)  # type: ignore[attr-defined]
@@ -233,15 +240,20 @@ def columns(transitions: int) -> Case:
         k = len(values)
         drive = Drive(np.tile(commands, (k, 1, 1)), 0)
         every = np.repeat(values, transitions, axis=0)
-        return simulation.rollout(every, np.tile(qpos, (k, 1)), np.tile(qvel, (k, 1)), drive)[0]
+        return simulation.rollout(every, np.tile(qpos, (k, 1)), np.tile(qvel, (k, 1)), drive)[0][:, -1]
 
-    def one_by_one() -> None:
-        for _ in values:
-            compiled = spec.compile()
+    def one_by_one() -> np.ndarray:
+        ends = []
+        for value in values:
+            compiled = correct(
+                spec.compile(), [e.with_values(value[s]) for e, s in zip(simulation.effects, simulation.slices)]
+            )
             data = mujoco.MjData(compiled)
             for q, v, ctrl in zip(qpos, qvel, commands):
                 data.qpos, data.qvel, data.ctrl = q, v, ctrl[0]
                 mujoco.mj_step(compiled, data, nstep=skip)
+                ends.append(data.qpos.copy())
+        return np.array(ends)
 
     variants = {"a compilation a column": one_by_one, "ours": batched}
     return Case("columns of the fit", "ms", 1, variants, "a compilation a column")
