@@ -25,7 +25,7 @@ from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
 from sb3_rpto.algorithms.worlds import find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.effects.names import near
-from sb3_rpto.envs.state import restore_state, save_state
+from sb3_rpto.envs.state import restore_state, restore_statistics, save_state, save_statistics
 from sb3_rpto.files import write_atomically
 
 Self = TypeVar("Self", bound="Resumable")
@@ -85,7 +85,7 @@ class Resumable(TwoWorlds):
 
         :param path: what ``save_replay_buffer`` wrote
         :param truncate_last_traj: as in SB3; without effect here
-        :raises ValueError: for the buffer of another algorithm; the model keeps its own then
+        :raises ValueError: for the buffer of another algorithm or of other environments; the model keeps its own then
         """
         kept = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
@@ -93,6 +93,13 @@ class Resumable(TwoWorlds):
             self.replay_buffer = kept
             raise ValueError(
                 f"{path} holds one world only; pass it as source_data= of from_source() or as target_data="
+            )
+        shapes = [(b.observation_space.shape, b.action_space.shape) for b in (self.replay_buffer, self)]
+        if shapes[0] != shapes[1]:
+            self.replay_buffer = kept
+            raise ValueError(
+                f"{path} holds observations and actions of shapes {shapes[0]}, the model's are {shapes[1]}; load the "
+                "buffers that were saved beside it"
             )
 
     @classmethod
@@ -182,9 +189,11 @@ def _picklable(config: dict[str, Any] | None) -> dict[str, Any] | None:
 
 def capture(model: Resumable) -> dict[str, Any]:
     """Where the two worlds and the random streams stand, as plain data."""
+    normaliser = None if model.env is None else model.get_vec_normalize_env()
     return {
         **_streams(model),
         "source": None if model.env is None else save_state(model.env),
+        "statistics": {} if normaliser is None else save_statistics(normaliser),
         "target": None if model.target_env is None else save_state(find_ledger(model.target_env).venv),
         "source_world": None if model._source_world is None else model._source_world.get_state(),
         "last_obs": model._last_obs,
@@ -246,10 +255,20 @@ def resume_source_phase(model: Resumable) -> None:
     if state is None:
         return
     assert model.env is not None  # learn() has checked
-    _put_back(model.env, state["source"])
+    _put_env_back(model, model.env, state)
     model._source_first_obs = np.asarray(model.env.reset())
     if not model._reseeded:
         _restore_streams(model, state)
+
+
+def _put_env_back(model: Resumable, env: VecEnv, state: dict[str, Any]) -> bool:
+    """Restore the source; where its state is unknown, what its VecNormalize has seen all the same, and False."""
+    if _put_back(env, state["source"]):
+        return True
+    normaliser = model.get_vec_normalize_env()
+    if normaliser is not None:
+        restore_statistics(normaliser, state.get("statistics", {}))
+    return False
 
 
 def _restore_streams(model: Resumable, state: dict[str, Any]) -> None:
@@ -264,7 +283,7 @@ def _restore_streams(model: Resumable, state: dict[str, Any]) -> None:
 def _put_source_back(model: Resumable, state: dict[str, Any]) -> bool:
     """Restore the source and its episodes; False where new ones begin."""
     assert model.env is not None  # learn() has checked
-    restored = _put_back(model.env, state["source"])
+    restored = _put_env_back(model, model.env, state)
     if not state["source_world"] or model._source_world is None:  # branches have no episodes
         return restored or state["source_world"] == {}
     if restored:

@@ -46,6 +46,7 @@ _VEC_WRAPPERS: dict[type[VecEnvWrapper], tuple[str, ...]] = {
     VecMonitor: ("episode_returns", "episode_lengths", "episode_count"),
 }
 _ENVS: dict[type[gym.Env], tuple[str, ...]] = {PendulumEnv: ("state", "last_u"), Continuous_MountainCarEnv: ("state",)}
+STATISTICS = ("obs_rms", "ret_rms")
 _VECTORISED = ("buf_obs", "buf_dones", "buf_rews", "buf_infos", "reset_infos", "_seeds", "_options")
 # Beside the simulation, gymnasium's MuJoCo tasks keep these; Pusher writes the drawn object's place into init_qpos.
 _MUJOCO = ("init_qpos", "init_qvel", "goal", "goal_pos", "cylinder_pos")
@@ -120,6 +121,17 @@ def _require(found: Any, saved: Any, what: str) -> None:
 
 def _name(layer: object) -> str:
     return f"{type(layer).__module__}.{type(layer).__qualname__}"
+
+
+def save_statistics(normaliser: VecNormalize) -> dict[str, Any]:
+    """What it has seen of observations and returns, which is known whatever it wraps."""
+    return copy.deepcopy({name: vars(normaliser)[name] for name in STATISTICS if name in vars(normaliser)})
+
+
+def restore_statistics(normaliser: VecNormalize, statistics: dict[str, Any]) -> None:
+    """Put back what :func:`save_statistics` returned, as far as ``normaliser`` has it; others share it as before."""
+    for name in statistics.keys() & vars(normaliser).keys():
+        _assign(normaliser, name, statistics[name])
 
 
 def _attributes(layer: Any, names: tuple[str, ...] | None) -> dict[str, Any]:

@@ -309,6 +309,45 @@ def test_a_source_phase_goes_on_with_its_statistics(tmp_path, monkeypatch):
     assert resumed.env.obs_rms.count > counted + 140
 
 
+class Unknown(gym.Wrapper):
+    """What it holds nobody knows, so that its world begins anew."""
+
+
+def normalised_unknown():
+    return VecNormalize(make_vec_env(lambda: Unknown(pendulum()), seed=3))
+
+
+def test_statistics_come_back_where_the_state_of_their_world_is_unknown(tmp_path):
+    model = small(RPO, normalised_unknown(), pendulum(12.0)).learn(20, source_timesteps=100)
+    model.save(tmp_path / "model")
+    resumed = RPO.load(tmp_path / "model", env=normalised_unknown(), target_env=pendulum(12.0))
+    resumed.learn(5, reset_num_timesteps=False)
+    assert resumed.env.obs_rms.count > model.env.obs_rms.count
+    assert resumed.env.ret_rms.count > model.env.ret_rms.count
+
+
+def test_a_source_phase_over_an_unknown_world_goes_on_with_its_statistics(tmp_path, monkeypatch):
+    model = small(RPO, normalised_unknown())
+    model.set_logger(configure(str(tmp_path), []))
+    train = warm._train_in_source
+    monkeypatch.setattr(warm, "_train_in_source", lambda model, steps, bar: train(model, steps // 2, bar))
+    model.learn(5, source_timesteps=300)
+    counted = model.env.obs_rms.count
+    monkeypatch.undo()
+    resumed = RPO.load(tmp_path / "pretrain.zip", env=normalised_unknown(), target_env=pendulum(12.0))
+    resumed.learn(5, source_timesteps=300)
+    assert resumed.env.obs_rms.count > counted + 140
+
+
+def test_the_buffer_of_other_environments_is_refused(tmp_path):
+    small(RPO, cartpole(), cartpole(pole_length=1.3)).save_replay_buffer(tmp_path / "other")
+    model = small(RPO)
+    kept = model.replay_buffer
+    with pytest.raises(ValueError, match=r"shapes \(\(4,\), \(1,\)\), the model's are \(\(3,\), \(1,\)\)"):
+        model.load_replay_buffer(tmp_path / "other")
+    assert model.replay_buffer is kept
+
+
 class SaveAt(BaseCallback):
     """Save in a hook at a step."""
 
