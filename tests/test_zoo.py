@@ -188,11 +188,55 @@ def test_a_resumed_run_is_the_one_that_was_not_stopped(trained):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [(["-n", "20"], "--n-timesteps above"), (["-n", "40", "-params", "gradient_steps:2"], "leave -params out")],
+    [
+        (["-n", "20"], "--n-timesteps above"),
+        (["-n", "40", "-params", "gradient_steps:2"], "leave gradient_steps out of -params"),
+    ],
 )
 def test_what_cannot_be_resumed_is_said(trained, options, message):
     with pytest.raises(ValueError, match=message):
         launch(trained.parents[1], "rpo", "--eval-freq", "-1", "-i", str(trained / "rl_model_20_steps.zip"), *options)
+
+
+def test_another_seed_begins_new_streams(trained):
+    checkpoint = str(trained / "rl_model_20_steps.zip")
+    common = ["-n", "30", "--eval-freq", "-1", "-i", checkpoint]
+    one, other = (
+        RPO.load(final(launch(trained.parents[1], "rpo", *common, "--seed", seed)), device="cpu") for seed in "12"
+    )
+    assert (one.seed, other.seed) == (1, 2)
+    theirs = other.policy.state_dict()
+    assert any(not th.equal(value, theirs[name]) for name, value in one.policy.state_dict().items())
+
+
+def test_worlds_are_as_they_were_where_a_run_goes_on(zoo, tmp_path, capsys):
+    from sb3_rpto.zoo.manager import config_beside
+
+    begun = launch(tmp_path, "rpo", "-n", "4", "--source-timesteps", "120", "--eval-freq", "-1", *COLD, "n_envs:2")
+    capsys.readouterr()
+    resumed = launch(tmp_path, "rpo", "-n", "8", "--eval-freq", "-1", "-i", str(final(begun)))
+    assert "As before: n_envs: 2, normalize: True" in capsys.readouterr().out
+    assert config_beside(str(final(resumed)))["n_envs"] == 2
+    last = launch(tmp_path, "rpo", "-n", "12", "--eval-freq", "-1", "-i", str(final(resumed)), "-params", "n_envs:1")
+    config = config_beside(str(final(last)))
+    assert (config["n_envs"], config["normalize"]) == (1, True)
+
+
+def test_a_buffer_of_a_later_time_is_told(trained):
+    with pytest.warns(UserWarning, match=r"holds 40 target transitions, .*taken 20"):
+        launch(trained.parents[1], "rpo", "-n", "41", "--eval-freq", "-1", "-i", str(_best_at_20(trained)))
+
+
+def _best_at_20(run: Path) -> Path:
+    """A best model of the middle of a run, beside the replay buffer of its end."""
+    return shutil.copy(run / "rl_model_20_steps.zip", run / "best_model.zip")
+
+
+def test_a_run_that_cannot_begin_leaves_no_folder(trained):
+    runs = sorted((trained.parent).iterdir())
+    with pytest.raises(ValueError, match="--n-timesteps above"):
+        launch(trained.parents[1], "rpo", "-n", "20", "-i", str(trained / "rl_model_20_steps.zip"))
+    assert sorted((trained.parent).iterdir()) == runs
 
 
 def test_enjoy_runs_the_agent(trained, capsys):

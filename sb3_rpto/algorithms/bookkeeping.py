@@ -108,7 +108,8 @@ class TwoWorlds(PolicySnapshots):
     _callback: BaseCallback | None
     #: where a loaded checkpoint left the worlds, until ``learn()`` puts them back
     _resume_state: dict[str, Any] | None
-    _reseeded: bool
+    #: given to a loaded model, which draws from new random streams then
+    _new_seed: int | None
 
     # ------------------------------------------------------------------ the worlds
 
@@ -230,7 +231,7 @@ class TwoWorlds(PolicySnapshots):
         super().set_random_seed(seed)
         if seed is None:
             return
-        self._reseeded = True
+        self._new_seed = seed
         if self.target_env is not None:
             self.target_env.seed(seed + TARGET_SEED_OFFSET)
         if self.dynamics is not None:
@@ -386,7 +387,7 @@ class TwoWorlds(PolicySnapshots):
                 self.action_noise.reset(**({"indices": [i]} if len(step["dones"]) > 1 else {}))
 
     def _store_step_cut_off(self) -> None:
-        """Store the target step in whose callback an exception ended the last run, for a run that goes on."""
+        """Store the target step in whose callback an exception ended the last run."""
         if self.target_env is not None and self._callback is not None and find_ledger(self.target_env).unstored:
             self.store_step(self._callback.locals)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import io
 import pathlib
+import pickle
 import random
 import warnings
 from collections.abc import Iterable
@@ -19,13 +20,13 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_rpto.algorithms.arguments import check_values_of, constructor_names
-from sb3_rpto.algorithms.bookkeeping import STEP, RuleOfEnvironment, TwoWorlds
+from sb3_rpto.algorithms.bookkeeping import STEP, TARGET_SEED_OFFSET, RuleOfEnvironment, TwoWorlds
 from sb3_rpto.algorithms.machine import check_simulator
 from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
 from sb3_rpto.algorithms.worlds import find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.effects.names import near
-from sb3_rpto.envs.state import restore_state, restore_statistics, save_state, save_statistics
+from sb3_rpto.envs.state import reseed, restore_state, restore_statistics, save_state, save_statistics
 from sb3_rpto.files import write_atomically
 
 Self = TypeVar("Self", bound="Resumable")
@@ -67,7 +68,8 @@ class Resumable(TwoWorlds):
         """Save all that a resumed run needs, except the replay buffers (``save_replay_buffer``); atomic for paths."""
         loaded = self._resume_state  # a loaded model that has not learned since stands where it was saved first
         learner = self.snapshots.get("learner")
-        self._resume_state = {**loaded, "warm": self._warm, "learner": learner} if loaded else capture(self)
+        since = {"warm": self._warm, "learner": learner, "seed": self._new_seed}
+        self._resume_state = {**loaded, **since} if loaded else capture(self)
         if self.env is not None:
             self._resume_state["normalised"] = normalises(self.get_vec_normalize_env())
         config, self.dynamics_config = self.dynamics_config, _picklable(self.dynamics_config)
@@ -88,7 +90,10 @@ class Resumable(TwoWorlds):
         :raises ValueError: for the buffer of another algorithm or of other environments; the model keeps its own then
         """
         kept = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+        except pickle.UnpicklingError as error:
+            raise ValueError(f"{path} is no replay buffer; pass what save_replay_buffer() wrote") from error
         if not isinstance(self.replay_buffer, DualReplayBuffer):
             self.replay_buffer = kept
             raise ValueError(
@@ -118,8 +123,11 @@ class Resumable(TwoWorlds):
         :param args: as SB3's ``load``
         :param target_env: the target, or its id
         :param kwargs: as SB3's ``load``
-        :raises ValueError: for a file that another algorithm saved, and arguments that a saved model does not change
+        :raises ValueError: for a file that another algorithm saved, a target that is not passed by name, and arguments
+            that a saved model does not change
         """
+        if args and not isinstance(args[0], str | th.device):
+            raise ValueError(f"load() takes {args[0]!r} for the device; pass a target by name, as target_env=")
         fixed = sorted(FIXED & set(kwargs))
         if fixed:
             raise ValueError(
@@ -140,9 +148,9 @@ class Resumable(TwoWorlds):
             saved_by = "RPO" if model.dynamics is None else "RTO or RPTO"
             raise ValueError(f"{path} was saved by {saved_by}, {cls.__name__} cannot continue it; load it there")
         check_values_of(model)
-        model._reseeded = False  # the seed of its beginning is not one given now
-        if kwargs.get("seed") is not None:
-            model.set_random_seed(kwargs["seed"])
+        # The seed of its beginning is not one given now; one that was given before it was saved anew is.
+        model._new_seed = None
+        model.set_random_seed(kwargs["seed"] if kwargs.get("seed") is not None else model._resume_state.get("seed"))
         model._warm = model._resume_state["warm"]
         if model._resume_state.get("learner") is not None:  # set_parameters() has dropped it
             model.snapshots["learner"] = model._resume_state["learner"]
@@ -245,8 +253,7 @@ def resume(model: Resumable) -> None:
             "restore_state(state), see docs/checkpoints.md)",
             stacklevel=3,
         )
-    if not model._reseeded:
-        _restore_streams(model, state)
+    _go_on_drawing(model, state)
 
 
 def resume_source_phase(model: Resumable) -> None:
@@ -256,9 +263,21 @@ def resume_source_phase(model: Resumable) -> None:
         return
     assert model.env is not None  # learn() has checked
     _put_env_back(model, model.env, state)
+    _go_on_drawing(model, state)
     model._source_first_obs = np.asarray(model.env.reset())
-    if not model._reseeded:
-        _restore_streams(model, state)
+
+
+def leave(model: Resumable) -> None:
+    """Begin a new run with a loaded model: what the policy needs of its checkpoint stays, and a step not yet stored."""
+    state, model._resume_state = model._resume_state, None
+    if state is None:
+        return
+    normaliser = model.get_vec_normalize_env()
+    if normaliser is not None:
+        restore_statistics(normaliser, state.get("statistics", {}))
+    if model.target_env is not None and state["unstored_step"] is not None:
+        model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
+        _store_unstored_step(model, state["unstored_step"])
 
 
 def _put_env_back(model: Resumable, env: VecEnv, state: dict[str, Any]) -> bool:
@@ -269,6 +288,21 @@ def _put_env_back(model: Resumable, env: VecEnv, state: dict[str, Any]) -> bool:
     if normaliser is not None:
         restore_statistics(normaliser, state.get("statistics", {}))
     return False
+
+
+def _go_on_drawing(model: Resumable, state: dict[str, Any]) -> None:
+    """Draw from the random streams that were saved, or, where a seed was given since, from new ones everywhere."""
+    seed = model._new_seed
+    if seed is None:
+        _restore_streams(model, state)
+        return
+    model.set_random_seed(seed)  # whatever was drawn since it was given
+    assert model.env is not None  # learn() has checked
+    reseed(model.env, seed)
+    if model.target_env is not None:
+        reseed(model.target_env, seed + TARGET_SEED_OFFSET)
+    if model._source_world is not None:
+        model._source_world.reseed()
 
 
 def _restore_streams(model: Resumable, state: dict[str, Any]) -> None:
@@ -302,17 +336,24 @@ def _put_target_back(model: Resumable, state: dict[str, Any]) -> bool:
     raw = {} if normaliser is None else {name: getattr(normaliser, name) for name in RAW}
     begun = model._last_obs, model._last_original_obs, raw
     restored = _put_back(find_ledger(model.target_env).venv, state["target"])
-    model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
     find_ledger(model.target_env).begin()
+    model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
     if state["unstored_step"] is not None:
-        if normaliser is not None:
-            vars(normaliser).update(state["unstored_step"]["raw"])
-        model.store_step(state["unstored_step"]["known"])
+        _store_unstored_step(model, state["unstored_step"])
     if not restored:
         model._last_obs, model._last_original_obs, raw = begun
         if normaliser is not None:
             vars(normaliser).update(raw)
     return restored
+
+
+def _store_unstored_step(model: Resumable, step: dict[str, Any]) -> None:
+    """Store a step that began at the model's last observation."""
+    assert model.target_env is not None  # whose step it is
+    normaliser = unwrap_vec_normalize(model.target_env)
+    if normaliser is not None:
+        vars(normaliser).update(step["raw"])
+    model.store_step(step["known"])
 
 
 def _put_back(env: VecEnv, state: dict[str, Any] | None) -> bool:

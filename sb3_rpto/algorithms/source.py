@@ -23,7 +23,7 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
 from sb3_rpto.effects.stance import StandingEnv
-from sb3_rpto.envs.state import copy_env, restore_state, save_state, whereabouts
+from sb3_rpto.envs.state import copy_env, reseed, restore_state, save_state, whereabouts
 
 RolloutStart = Literal["target", "source", "mix"]
 
@@ -53,6 +53,9 @@ class SourceWorld(ABC):
 
     def set_state(self, state: dict[str, Any]) -> None:  # noqa: B027
         """Continue where :meth:`get_state` was called; the source environment's own state is restored elsewhere."""
+
+    def reseed(self) -> None:  # noqa: B027
+        """Draw new random streams of its own from the dynamics', which were seeded just now."""
 
 
 def make_source_world(
@@ -196,6 +199,11 @@ class SimulatorSource(EpisodeSource):
         self._phi: tuple[Any, ...] = self._current()
         self._rng = np.random.default_rng(self._draw())
         super().__init__(share_normalisation(stacked, env))
+
+    def reseed(self) -> None:
+        """See :meth:`SourceWorld.reseed`."""
+        reseed(self.env, self._draw())
+        self._rng = np.random.default_rng(self._draw())
 
     def _draw(self) -> int:
         return int(th.randint(2**31 - 1, (1,), generator=self.dynamics.generator))

@@ -210,13 +210,12 @@ class TransferAlgorithm(Looping):
         self._since_fit = 0
         self._rollout_began_at = 0
         self._round_open = False
-        self._source_world = None
-        self._source_first_obs = None
+        self._source_world = self._source_first_obs = None
         self._null_check = None
         self._has_target_rules = False
         self._callback = None
         self._resume_state = None
-        self._reseeded = False
+        self._new_seed = None
 
         if _init_setup_model:
             self._apply_preset()
@@ -345,10 +344,9 @@ class TransferAlgorithm(Looping):
         arguments.check_ready(self, total_timesteps, source_timesteps)
         if source_timesteps is None:
             source_timesteps = min(10 * total_timesteps, 300_000)
-        if not reset_num_timesteps:
-            self._store_step_cut_off()
-        elif self._warm:  # else the source phase goes on all the same
-            self._resume_state = None
+        self._store_step_cut_off()
+        if reset_num_timesteps and self._warm:  # else the source phase goes on all the same
+            checkpoint.leave(self)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )

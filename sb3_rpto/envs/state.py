@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import wrappers
 from gymnasium.envs.classic_control import Continuous_MountainCarEnv, PendulumEnv
+from gymnasium.utils.seeding import np_random
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
@@ -239,6 +240,19 @@ def _restore_simulation(base: gym.Env, saved: dict[str, Any]) -> None:
         import mujoco
 
         mujoco.mj_copyData(base.data, base.model, pickle.loads(saved["simulation"]))  # type: ignore[attr-defined]
+
+
+def reseed(env: VecEnv, seed: int) -> None:
+    """Begin new random streams in the midst of episodes, as a seeded reset begins them.
+
+    Of a DummyVecEnv's members, each from a seed of its own; nothing is done to other VecEnvs.
+
+    :param env: the environment
+    :param seed: of the first member
+    """
+    base = env.unwrapped
+    for index, member in enumerate(base.envs if type(base) is DummyVecEnv else ()):
+        member.unwrapped.np_random = np_random(seed + index)[0]
 
 
 def whereabouts(env: VecEnv) -> list[tuple[Any, ...]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import warnings
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import Any
 
 import gymnasium as gym
 import optuna
+import yaml
 from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import get_callback_list
@@ -26,6 +28,9 @@ from sb3_rpto.algorithms.warm import carried_arguments, load_sac
 from sb3_rpto.zoo.samplers import SAMPLERS
 from sb3_rpto.zoo.settings import ALGORITHMS, section, shipped_file, source_of
 
+#: Settings that no model carries: of the worlds, and of what is called beside the training.
+OUTSIDE = ("n_envs", "normalize", "env_wrapper", "monitor_kwargs", "callback")
+
 
 @dataclass(frozen=True)
 class Start:
@@ -35,12 +40,14 @@ class Start:
     :param source_model: zip of the SAC that was trained there; None: the run trains one first
     :param source_data: transitions of the source, as ``from_source`` takes them
     :param source_timesteps: of the training in the source, as ``learn`` takes them
+    :param seed: one that was asked for; None: the zoo draws one
     """
 
     source_env: str
     source_model: str | None = None
     source_data: str | None = None
     source_timesteps: int | None = None
+    seed: int | None = None
 
 
 class TransferManager(ExperimentManager):
@@ -70,7 +77,8 @@ class TransferManager(ExperimentManager):
         if not keywords.get("config") and (algo in ALGORITHMS or source_of(env_id)):
             self._shipped = shipped_file(algo)
             keywords["config"] = str(self._shipped) if self._shipped else None
-        vars(args).update(vars(start) if start else {})  # args.yml, which the zoo writes beside the agent, holds them
+        if start is not None:  # args.yml, which the zoo writes beside the agent, holds them
+            vars(args).update({name: value for name, value in vars(start).items() if name != "seed"})
         super().__init__(args, algo, env_id, *positional, **keywords)
         self.start = start
         self.resumes = self.continue_training
@@ -79,17 +87,39 @@ class TransferManager(ExperimentManager):
         self._n_source_envs = 1
         self._asked = set(self.custom_hyperparams or {})
 
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """As the zoo's; the folder of a run that could not begin is removed, lest ``enjoy`` takes it for the newest."""
+        had = Path(self.save_path).exists()
+        try:
+            return super().setup_experiment()
+        except BaseException:
+            if not had:
+                shutil.rmtree(self.save_path, ignore_errors=True)
+            raise
+
     # ------------------------------------------------------------------ settings
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """As the zoo's; in a file of ours, a target has the settings of its task."""
+        """As the zoo's; in a file of ours, a target has the settings of its task.
+
+        A run that goes on has the worlds of the ``config.yml`` that the zoo left beside its zip, unless it is told
+        otherwise.
+        """
         env_name = self.env_name
         if self._shipped is not None:
             self.env_name = type(env_name)(section(env_name.gym_id))
         try:
-            return super().read_hyperparameters()
+            hyperparams, saved = super().read_hyperparameters()
         finally:
             self.env_name = env_name
+        if self.resumes and self.start is not None:
+            had = config_beside(self.trained_agent)
+            kept = {name: had[name] for name in OUTSIDE if name in had and name not in self._asked}
+            if kept:
+                print(f"As before: {', '.join(f'{name}: {value}' for name, value in kept.items())}")
+            hyperparams.update(kept)
+            saved.update(kept)
+        return hyperparams, saved
 
     def load_trial(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """As the zoo's; a trial's parameters win over what a source agent brings along."""
@@ -170,8 +200,12 @@ class TransferManager(ExperimentManager):
             return super()._load_pretrained_agent(hyperparams, env)
         if not self.resumes:
             return self._begin(self.start, hyperparams, self._asked, env, self.create_target(), seed=self.seed)
-        if self.custom_hyperparams:
-            raise ValueError("--trained-agent goes on with the settings that it was saved with; leave -params out")
+        carried = sorted(self._asked - set(OUTSIDE))
+        if carried:
+            raise ValueError(
+                f"--trained-agent goes on with the settings that it was saved with; leave {', '.join(carried)} out of "
+                f"-params, which may set {', '.join(OUTSIDE)}"
+            )
         print(f"Resuming {self.trained_agent}")
         model = ALGORITHMS[self.algo].load(
             self.trained_agent,
@@ -185,9 +219,19 @@ class TransferManager(ExperimentManager):
             raise ValueError(
                 f"--trained-agent has taken {model.num_timesteps} target steps already; pass --n-timesteps above that"
             )
+        if self.start.seed is not None and self.start.seed != model.seed:
+            model.seed = self.start.seed
+            model.set_random_seed(model.seed)
         data = beside(self.trained_agent, "replay_buffer")
         if data is not None and data.is_file():
             model.load_replay_buffer(data)
+            held = model.replay_buffer.target.size()
+            if held > model.num_timesteps:
+                warnings.warn(
+                    f"{data.name} holds {held} target transitions, {self.trained_agent} has taken "
+                    f"{model.num_timesteps}: the run goes on with transitions that came after that model",
+                    stacklevel=2,
+                )
         else:
             warnings.warn(
                 f"there is no replay buffer beside {self.trained_agent}: the run goes on with empty ones "
@@ -304,6 +348,15 @@ def beside(trained_agent: str, kind: str) -> Path | None:
     if stem.startswith("rl_model_") and stem.endswith("_steps"):
         return path.with_name(f"rl_model_{kind}_{stem.removeprefix('rl_model_')}.pkl")
     return path.with_name(f"pretrain_{kind}.pkl" if stem == "pretrain" else f"{kind}.pkl")
+
+
+def config_beside(trained_agent: str) -> dict[str, Any]:
+    """The settings that the zoo saved for the run of a zip; none where it is not in such a run's folder.
+
+    :param trained_agent: the zip
+    """
+    found = sorted(Path(trained_agent).parent.glob("*/config.yml"))
+    return dict(yaml.unsafe_load(found[0].read_text())) if len(found) == 1 else {}  # it holds an OrderedDict's tag
 
 
 def _close(model: TransferAlgorithm) -> None:

@@ -104,6 +104,7 @@ def _start(parser: argparse.ArgumentParser, ours: argparse.Namespace, rest: list
     known.add_argument("--algo", default="ppo")
     known.add_argument("--env", default="")
     known.add_argument("-i", "--trained-agent")
+    known.add_argument("--seed", type=int, default=-1)
     known.add_argument("--eval-env-kwargs", nargs="+")
     known.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
     theirs, _ = known.parse_known_args(rest)
@@ -132,7 +133,8 @@ def _start(parser: argparse.ArgumentParser, ours: argparse.Namespace, rest: list
         parser.error("-optimize needs --source-model: without it, every trial would first train an agent in the source")
     if ours.source_model is not None and theirs.trained_agent:
         parser.error("--source-model begins a run and -i goes on with one; leave one of them out")
-    return Start(source, ours.source_model, ours.source_data, ours.source_timesteps)
+    seed = theirs.seed if theirs.seed >= 0 else None  # as the zoo has it
+    return Start(source, ours.source_model, ours.source_data, ours.source_timesteps, seed)
 
 
 @contextmanager

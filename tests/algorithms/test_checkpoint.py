@@ -291,6 +291,91 @@ def test_a_seed_that_is_given_after_loading_counts(how, tmp_path):
             assert_same(one, different)
 
 
+def test_branches_of_a_checkpoint_see_other_resets(tmp_path):
+    small(RPO, source_steps=2).learn(20, source_timesteps=60).save(tmp_path / "m")
+
+    def branch(seed):
+        loaded = RPO.load(tmp_path / "m", pendulum(), target_env=pendulum(12.0), seed=seed)
+        loaded.learn(200, reset_num_timesteps=False)  # an episode of the target lasts 200 steps
+        ends = np.flatnonzero(loaded.replay_buffer.target.dones[:199, 0])
+        source_ends = np.flatnonzero(loaded.replay_buffer.source.dones[:399, 0])
+        assert len(ends)
+        assert len(source_ends)
+        worlds = ((loaded.replay_buffer.target, ends), (loaded.replay_buffer.source, source_ends))
+        return [buffer.observations[rows + 1, 0] for buffer, rows in worlds]
+
+    for one, other in zip(branch(1), branch(2)):
+        assert len(one) == len(other)
+        assert (one != other).any(axis=1).all()
+
+
+def test_a_randomised_simulator_draws_anew_for_a_new_seed(tmp_path):
+    cls, source, target, kwargs = CASES["rpto-physical-mujoco"]
+    model = small(cls, source(), target(), **kwargs).learn(60, source_timesteps=40)
+    model.save(tmp_path / "m")
+    model.save_replay_buffer(tmp_path / "m.pkl")
+
+    def drawn(**seed):
+        loaded = cls.load(tmp_path / "m", source(), target_env=target(), **seed)
+        loaded.load_replay_buffer(tmp_path / "m.pkl")
+        loaded.learn(1, reset_num_timesteps=False)
+        return loaded._source_world._rng.random()
+
+    assert drawn() == drawn()
+    assert len({drawn(), drawn(seed=1), drawn(seed=2)}) == 3
+
+
+def test_a_seed_given_on_load_outlives_being_saved_anew(tmp_path):
+    model = small(RPO).learn(10, source_timesteps=60)
+    model.save(tmp_path / "m")
+    model.save_replay_buffer(tmp_path / "m.pkl")
+    seeded = RPO.load(tmp_path / "m", pendulum(), target_env=pendulum(12.0), seed=2)
+    seeded.save(tmp_path / "seeded")
+    again = RPO.load(tmp_path / "seeded", pendulum(), target_env=pendulum(12.0))
+    unseeded = RPO.load(tmp_path / "m", pendulum(), target_env=pendulum(12.0))
+    for one in (unseeded, seeded, again):
+        one.load_replay_buffer(tmp_path / "m.pkl")
+        one.learn(10, reset_num_timesteps=False)
+    assert_same(seeded, again)
+    with pytest.raises(AssertionError):
+        assert_same(unseeded, again)
+
+
+def test_a_new_run_of_a_checkpoint_has_its_statistics(tmp_path):
+    def source():
+        return VecNormalize(make_vec_env(pendulum, seed=3))
+
+    model = small(RPO, source()).learn(20, source_timesteps=100)
+    model.save(tmp_path / "m")
+    begun = RPO.load(tmp_path / "m", env=source(), target_env=pendulum(12.0)).learn(5)
+    assert begun.num_timesteps == 5
+    assert begun.env.obs_rms.count > model.env.obs_rms.count
+
+
+def test_a_new_run_of_a_callbacks_checkpoint_keeps_its_last_step(tmp_path):
+    callback = CheckpointCallback(15, str(tmp_path), "m", save_replay_buffer=True)
+    whole = small(RPO).learn(20, callback, source_timesteps=60)
+    loaded = RPO.load(tmp_path / "m_15_steps", pendulum(), target_env=pendulum(12.0))
+    loaded.load_replay_buffer(tmp_path / "m_replay_buffer_15_steps.pkl")
+    assert loaded.replay_buffer.target.size() == 14
+    loaded.learn(5)
+    assert loaded.replay_buffer.target.size() == 20
+    for name in ("observations", "next_observations", "actions", "rewards"):
+        kept, had = (getattr(m.replay_buffer.target, name)[:15] for m in (loaded, whole))
+        np.testing.assert_array_equal(kept, had)
+
+
+def test_files_and_arguments_that_load_cannot_take_are_named(tmp_path):
+    model = small(RPO).learn(10, source_timesteps=60)
+    model.save(tmp_path / "m.zip")
+    with pytest.raises(ValueError, match="pass a target by name, as target_env="):
+        RPO.load(tmp_path / "m", pendulum(), pendulum(12.0))
+    kept = model.replay_buffer
+    with pytest.raises(ValueError, match=r"m.zip is no replay buffer; pass what save_replay_buffer\(\) wrote"):
+        model.load_replay_buffer(tmp_path / "m.zip")
+    assert model.replay_buffer is kept
+
+
 def test_a_source_phase_goes_on_with_its_statistics(tmp_path, monkeypatch):
     def source():
         return VecNormalize(make_vec_env(pendulum, seed=3))
