@@ -9,7 +9,7 @@ import pickle
 import random
 import warnings
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import cloudpickle
 import gymnasium as gym
@@ -58,6 +58,8 @@ class Resumable(TwoWorlds):
 
     #: whether the policy knows the source, by a warm start or by training there
     _warm: bool
+    #: arguments that other algorithms have and this one does not use
+    unused: ClassVar[frozenset[str]] = frozenset()
 
     def save(
         self,
@@ -72,6 +74,7 @@ class Resumable(TwoWorlds):
         self._resume_state = {**loaded, **since} if loaded else capture(self)
         if self.env is not None:
             self._resume_state["normalised"] = normalises(self.get_vec_normalize_env())
+        self._resume_state["algorithm"] = _algorithm(type(self))
         config, self.dynamics_config = self.dynamics_config, _picklable(self.dynamics_config)
         try:
             write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
@@ -128,6 +131,7 @@ class Resumable(TwoWorlds):
         """
         if args and not isinstance(args[0], str | th.device):
             raise ValueError(f"load() takes {args[0]!r} for the device; pass a target by name, as target_env=")
+        cls.refuse_unused(kwargs)
         fixed = sorted(FIXED & set(kwargs))
         if fixed:
             raise ValueError(
@@ -144,9 +148,6 @@ class Resumable(TwoWorlds):
                 f"{path} was not saved by {cls.__name__}; start from a SAC model by "
                 f"{cls.__name__}.from_source(path, env, target_env=...)"
             )
-        if (model.dynamics is not None) != cls.updates_dynamics:
-            saved_by = "RPO" if model.dynamics is None else "RTO or RPTO"
-            raise ValueError(f"{path} was saved by {saved_by}, {cls.__name__} cannot continue it; load it there")
         check_values_of(model)
         # The seed of its beginning is not one given now; one that was given before it was saved anew is.
         model._new_seed = None
@@ -164,6 +165,30 @@ class Resumable(TwoWorlds):
             model.set_target_env(target_env)
         return model
 
+    @classmethod
+    def refuse_unused(cls, passed: Iterable[str]) -> None:
+        """Refuse arguments in :attr:`unused`.
+
+        :param passed: names of the arguments
+        :raises ValueError: naming those
+        """
+        unused = sorted(cls.unused.intersection(passed))
+        if unused:
+            raise ValueError(f"{cls.__name__} does not use {unused}; leave them out or use RPTO")
+
+    def _setup_model(self) -> None:
+        saved_by = (self._resume_state or {}).get("algorithm")  # while a checkpoint is loaded
+        if saved_by is not None and saved_by != _algorithm(type(self)):
+            raise ValueError(f"this was saved by {saved_by}, {type(self).__name__} cannot continue it; load it there")
+        self._check_numbers()
+        super()._setup_model()
+
+    def _check_numbers(self) -> None:
+        """Refuse numbers of its own out of range.
+
+        :raises ValueError: naming the argument and its value
+        """
+
     def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto") -> None:
         """As in SB3; a model that was given parameters counts as warm-started and is not trained in the source."""
         super().set_parameters(load_path_or_dict, exact_match, device)
@@ -180,6 +205,12 @@ class Resumable(TwoWorlds):
             if hasattr(self.dynamics, "optimizer"):
                 state_dicts.append("dynamics.optimizer")
         return state_dicts, variables
+
+
+def _algorithm(cls: type) -> str:
+    """Whose checkpoints a class goes on with: its own, of a user's class those of what it is derived from."""
+    name = next(base.__name__ for base in cls.__mro__ if base.__module__.startswith("sb3_rpto."))
+    return "RTO or RPTO" if name in ("RTO", "RPTO") else name
 
 
 def _picklable(config: dict[str, Any] | None) -> dict[str, Any] | None:

@@ -131,19 +131,18 @@ class LoopCloser:
         assert model.env is not None
         data = model.transitions("target")
         noise, before = dynamics.observation_noise, dynamics.error(data)
-        self._traced_at = model.replay_buffer.target_added
         try:
             measured = Measurements.from_replay(model.replay_buffer, model.env, noise=noise)
             report = self._trace(model, dynamics, measured, horizon_of(measured, single_env(model.env)))
         except ValueError as error:  # of the data: what was passed was looked at before; a run must not end by it
-            self._error, self._untraced = before, True
+            self._traced_at, self._error, self._untraced = model.replay_buffer.target_added, before, True
             warnings.warn(
                 f"{len(data)} target transitions were not traced: {error}; a trace is tried again when there are twice "
                 "as many",
                 stacklevel=2,
             )
             return
-        self._untraced = False
+        self._traced_at, self._untraced = model.replay_buffer.target_added, False
         added = self._take(model, dynamics, report, data, before if noise is None else math.inf)
         self._error = dynamics.error(data)
         _say(model, report, added, f"{len(data)} target transitions", before, self._error)

@@ -27,8 +27,6 @@ class Looping(Resumable):
     retrain_steps: int
     #: the robot's log, where one was given
     measured: Measurements | None
-    #: step 3 of a round is done, its steps 5 and 6 are not
-    _round_open: bool
 
     def learns_at_fits(self) -> bool:
         """Whether steps 3 and 5 wait for the next fit."""
@@ -38,7 +36,7 @@ class Looping(Resumable):
         """Steps 5 and 6, or the latter's fit alone where the policy learns at fits."""
         if self.learns_at_fits():
             self._owed += self._collected
-            self._round_open = False  # nothing is left to make up for, whatever interrupts a fit
+            self._count_for_fit()
             self.fit_dynamics()
         else:
             super().update()

@@ -29,13 +29,14 @@ class MBPO(TransferAlgorithm):
     ``update`` (another loss, another policy optimiser: SLBO).
 
     :param args: as those of :class:`~sb3_rpto.algorithms.transfer.TransferAlgorithm`
-    :param kwargs: likewise, without those in :data:`UNUSED`; what is not passed is :meth:`published`
-    :raises ValueError: for an argument in :data:`UNUSED`
+    :param kwargs: likewise, without those in :attr:`unused`; what is not passed is :meth:`published`
+    :raises ValueError: for an argument in :attr:`unused`
     """
 
     updates_policy: ClassVar[bool] = True
     updates_dynamics: ClassVar[bool] = True
 
+    unused: ClassVar[frozenset[str]] = UNUSED
     #: the paper's numbers, in constructor arguments; of the tasks by their names where they differ
     NUMBERS: ClassVar[dict[str, Any]] = {
         "gradient_steps": 20,
@@ -63,9 +64,7 @@ class MBPO(TransferAlgorithm):
         self.weighting = None
 
     def _check_arguments(self) -> None:
-        unused = sorted(UNUSED & self._passed)
-        if unused:
-            raise ValueError(f"{type(self).__name__} does not use {unused}; leave them out or use RPTO")
+        self.refuse_unused(self._passed)
         super()._check_arguments()
 
     def sample_batches(self, count: int, batch_size: int) -> Iterator[tuple[ReplayBufferSamples, ReplayBufferSamples]]:

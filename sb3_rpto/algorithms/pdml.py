@@ -91,10 +91,6 @@ class PDML(MBPO):
     """
 
     def __init__(self, *args: Any, block_steps: int = 250, newest_share: float = 0.02, **kwargs: Any) -> None:
-        if block_steps < 1:
-            raise ValueError(f"block_steps must be at least 1, got {block_steps}")
-        if not 0 <= newest_share < 1:
-            raise ValueError(f"newest_share must lie in [0, 1), got {newest_share}")
         self.block_steps, self.newest_share = block_steps, newest_share
         #: whole blocks, oldest first; what each weighs now; target steps since the last of them ended
         self.blocks: list[Block] = []
@@ -109,6 +105,13 @@ class PDML(MBPO):
         if self.use_sde:
             raise NotImplementedError("use_sde=True: PDML compares Gaussian policies; leave it out")
 
+    def _check_numbers(self) -> None:
+        super()._check_numbers()
+        if self.block_steps < 1:
+            raise ValueError(f"block_steps must be at least 1, got {self.block_steps}")
+        if not 0 <= self.newest_share < 1:
+            raise ValueError(f"newest_share must lie in [0, 1), got {self.newest_share}")
+
     def set_target_env(self, env: GymEnv | str) -> None:
         """Set the target; in the place of another one, with no blocks of it."""
         replaced = self.target_env is not None
@@ -120,9 +123,12 @@ class PDML(MBPO):
         assert self.dynamics is not None  # it updates them
         return AdaptedBranches(self.dynamics, self.rollout_start)
 
+    def _count_for_fit(self) -> None:
+        super()._count_for_fit()
+        self._since_block += self._collected
+
     def fit_dynamics(self) -> None:
         """End a block where one is full, then fit as MBPO does."""
-        self._since_block += self._collected
         if self._since_block >= self.block_steps:
             actor = {name: value.detach().cpu().clone() for name, value in self.actor.state_dict().items()}
             self.blocks.append(Block(self._since_block, actor))

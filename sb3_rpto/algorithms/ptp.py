@@ -174,10 +174,13 @@ class PTP(MBPO):
             self._passed -= {"n_candidates"}
         self.n_candidates = self.NUMBERS["n_candidates"] if n_candidates is None else n_candidates
         self.horizon, self.beta, self.error_steps = horizon, beta, error_steps
+        super().__init__(*args, **kwargs)
+
+    def _check_numbers(self) -> None:
+        super()._check_numbers()
         for name in ("n_candidates", "horizon", "error_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         super()._setup_model()

@@ -64,16 +64,11 @@ class SLBO(MBPO):
         numbers = {"iterations": iterations, "model_steps": model_steps, "policy_updates": policy_updates}
         numbers |= {"rollout_samples": rollout_samples, "rollout_length": rollout_length}
         for name, value in numbers.items():
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
             setattr(self, name, value)
-        if rollout_samples % rollout_length:
-            raise ValueError(
-                f"rollout_samples={rollout_samples} is no multiple of rollout_length={rollout_length}; the model runs "
-                "rollout_samples / rollout_length episodes side by side"
-            )
         self.trpo_kwargs = dict(trpo_kwargs or {})
         self._cloned = False
+        #: of the stage under way, which goes on there where it was interrupted
+        self._iterations_done = 0
         super().__init__(*args, **kwargs)
 
     iterations: int
@@ -81,6 +76,17 @@ class SLBO(MBPO):
     policy_updates: int
     rollout_samples: int
     rollout_length: int
+
+    def _check_numbers(self) -> None:
+        super()._check_numbers()
+        for name in ("iterations", "model_steps", "policy_updates", "rollout_samples", "rollout_length"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.rollout_samples % self.rollout_length:
+            raise ValueError(
+                f"rollout_samples={self.rollout_samples} is no multiple of rollout_length={self.rollout_length}; the "
+                "model runs rollout_samples / rollout_length episodes side by side"
+            )
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -124,7 +130,9 @@ class SLBO(MBPO):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """The action of TRPO's policy; arguments as in SB3."""
+        """The action of TRPO's policy, before it is cloned of the teacher's; arguments as in SB3."""
+        if not self._cloned:
+            return super().predict(observation, state, episode_start, deterministic)  # type: ignore[arg-type]
         return self.trpo.policy.predict(observation, state, episode_start, deterministic)  # type: ignore[arg-type]
 
     def take_snapshot(self, name: str) -> None:
@@ -145,10 +153,9 @@ class SLBO(MBPO):
 
     def update(self) -> None:
         """A stage every ``model_train_freq`` target steps."""
-        self._since_fit += self._collected
+        self._count_for_fit()
         if self._since_fit < self.model_train_freq or self.replay_buffer.size() < 2:
             return
-        self._since_fit = 0
         assert self.dynamics is not None
         assert self.env is not None  # learn() has checked
         self._adopt_target_rules()
@@ -156,17 +163,22 @@ class SLBO(MBPO):
         self.logger.record("dynamics/error_before", self.dynamics.error(data))
         rollouts = DynamicsVecEnv(self.dynamics, self.env, self.trpo.n_envs, self.rollout_length)
         self.trpo.env = share_normalisation(rollouts, self.env)
-        for _ in range(self.iterations):
+        log: dict[str, float] = {}
+        while self._iterations_done < self.iterations:
             log = self.dynamics.fit(data, max_steps=self.model_steps)
             for _ in range(self.policy_updates):  # a call collects one rollout from initial states, and learns of it
                 self.trpo.learn(self.rollout_samples, log_interval=2)  # never: it has one iteration
                 self.source_timesteps += self.rollout_samples
+            self._iterations_done += 1
+        self._iterations_done = self._since_fit = 0
         self._n_updates += self.iterations * self.policy_updates
         for name, value in log.items():
             self.logger.record(f"dynamics/{name}", value)
         for name in ("policy_objective", "value_loss", "kl_divergence_loss", "std"):
             self.logger.record(f"slbo/{name}", self.trpo.logger.name_to_value[f"train/{name}"])
         self.logger.record("dynamics/error", self.dynamics.error(data))
+        if self._offline:  # as in fit_dynamics()
+            self.dump_logs()
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

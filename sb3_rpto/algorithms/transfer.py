@@ -369,16 +369,12 @@ class TransferAlgorithm(Looping):
             self._round_open = True
             if not self.interact_with_target(callback, log_interval):  # step 4
                 break
-            self._end_round()
+            self.update()  # steps 5 and 6
         if self.loop is not None and self._steps_left() <= 0:
             self.loop.finish(self)
         callback.on_training_end()
         self._callback = None
         return self
-
-    def _end_round(self) -> None:
-        self.update()  # steps 5 and 6
-        self._round_open = False
 
     def _finish_open_round(self, forget: bool) -> None:
         """Make up for the steps 5 and 6 before which the last run was stopped or saved; step 3 is not done twice.
@@ -393,7 +389,7 @@ class TransferAlgorithm(Looping):
                 return
             self._collected = taken
         if self._round_open:
-            self._end_round()
+            self.update()
 
     def begin_in_source(self, source_timesteps: int, progress_bar: bool) -> None:
         """What Algorithm 1 takes as its input: a policy, its critic and phi_0 that know the source.

@@ -55,8 +55,10 @@ class RelativeUpdate(SAC):
     model_train_freq: int
     #: plain SAC in the source is under way
     _pretraining: bool
-    #: target steps taken since the last update (with recorded target data: calls of the source), those since the
-    #: last fit, and actor updates so far
+    #: step 3 of a round is done, its steps 5 and 6 are not
+    _round_open: bool
+    #: target steps taken in the last rollout (with recorded target data: calls of the source), those since the last
+    #: fit, and actor updates so far
     _collected: int
     _since_fit: int
     _actor_updates: int
@@ -73,7 +75,13 @@ class RelativeUpdate(SAC):
     def update(self) -> None:
         """Steps 5 and 6: updates of critic and actor for each new target step, then the dynamics."""
         self.train(self._collected * self.updates_per_step, self.batch_size)
+        self._count_for_fit()
         self.fit_dynamics()
+
+    def _count_for_fit(self) -> None:
+        """The round's steps count towards the next fit. Where a fit is interrupted, it alone is made again."""
+        self._since_fit += self._collected
+        self._round_open = False
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """Step 5, the critic on D_source, and step 6, the actor by RPO; given the same batch it is SAC's update.
@@ -137,13 +145,12 @@ class RelativeUpdate(SAC):
 
     def fit_dynamics(self) -> None:
         """Step 6, RTO: every ``model_train_freq`` target steps move phi towards D_target by the weighted loss."""
-        self._since_fit += self._collected
         ready = self._traces_log or self.replay_buffer.size() >= 2
         if not self.updates_dynamics or self._since_fit < self.model_train_freq or not ready:
             return
-        self._since_fit = 0
         if not self._traces_log:
             self._fit_to_transitions()
+        self._since_fit = 0
         self._rehearse()
         if self._offline:  # SB3 writes its logs at the end of target episodes; there are none
             self.dump_logs()
