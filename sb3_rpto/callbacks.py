@@ -61,6 +61,7 @@ class RelativityGapCallback(TransferCallback):
         more have a smaller standard error
     :param verbose: as in SB3
     :raises ValueError: for a number below 1; at the start of training for gamma = 1, where the sums have no end
+    :raises TypeError: at the start of training of SLBO, whose policy is not SAC's
     """
 
     def __init__(self, frequency: int = 1_000, n_episodes: int = 10, verbose: int = 0) -> None:
@@ -77,6 +78,8 @@ class RelativityGapCallback(TransferCallback):
         super()._init_callback()
         if self.model.gamma >= 1:
             raise ValueError(f"{type(self).__name__} needs gamma below 1, the model's is {self.model.gamma}")
+        if hasattr(self.model, "trpo"):
+            raise TypeError(f"{type(self).__name__} compares SAC's policies; SLBO acts by TRPO's")
 
     def _on_training_start(self) -> None:
         self._n_due = self.num_timesteps // self.frequency

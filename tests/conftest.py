@@ -41,6 +41,7 @@ def small(cls, env=None, target=None, **kwargs):
     target = pendulum(12.0) if target is None else target
     settings = {"policy_kwargs": SMALL_POLICY, "batch_size": 32, "seed": 0, "source_steps": 8, "device": "cpu"}
     settings["gradient_steps"] = 1
+    settings = {name: value for name, value in settings.items() if name not in cls.unused}
     if cls.updates_dynamics and kwargs.get("dynamics", "ensemble") == "ensemble":
         settings |= {"dynamics_kwargs": SMALL_ENSEMBLE, "model_train_freq": 50}
     return cls("MlpPolicy", env, target_env=target, **{**settings, **kwargs})

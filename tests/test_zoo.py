@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import shutil
 import sys
 from pathlib import Path
@@ -264,6 +265,56 @@ def test_another_factor_is_a_target_too(zoo, agent, tmp_path):
     assert RPO.load(final(run), device="cpu").num_timesteps == 4
 
 
+def test_a_normalised_agent_is_played_as_it_was_trained(zoo, tmp_path, monkeypatch):
+    small = ["-params", "normalize:dict(norm_obs=True,norm_reward=False)", "policy_kwargs:dict(net_arch=[16])"]
+    sac = final(launch(tmp_path, "sac", "-n", "20", "--eval-freq", "-1", *small, env=SOURCE))
+    run = launch(tmp_path, "rpo", "--source-model", str(sac), "-n", "4", "--eval-freq", "-1", *SMALL)
+    assert RPO.load(final(run), device="cpu")._resume_state["normalised"]
+    played, rl_zoo3_enjoy = [], pytest.importorskip("rl_zoo3.enjoy")
+    make = rl_zoo3_enjoy.create_test_env
+    monkeypatch.setattr(rl_zoo3_enjoy, "create_test_env", lambda *a, **k: played.append(make(*a, **k)) or played[-1])
+    options = ["--algo", "rpo", "--env", TARGET, "-f", str(tmp_path), "--no-render", "-n", "5", "--device", "cpu"]
+    assert enjoy.main(options) == 0
+    assert isinstance(played[0], VecNormalize)
+    warm = launch(tmp_path, "sac", "-i", str(sac), "-n", "4", "--eval-freq", "-1")
+    assert (warm / final(warm).stem / "vecnormalize.pkl").is_file()
+
+
+def test_ctrl_c_in_the_source_phase_saves_also_with_a_progress_bar(zoo, tmp_path, monkeypatch):
+    begin = RPO.begin_in_source
+
+    def interrupted(model, *args):
+        begin(model, *args)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RPO, "begin_in_source", interrupted)
+    run = launch(tmp_path, "rpo", "-P", "-n", "4", "--source-timesteps", "120", "--eval-freq", "-1", *COLD)
+    assert RPO.load(final(run), device="cpu")._pretrained_steps == 120
+
+
+def test_what_a_search_draws_joins_the_settings():
+    manager = pytest.importorskip("sb3_rpto.zoo.manager", reason="the extra 'zoo' is not installed")
+    drawn = {"rollout_start": "mix", "dynamics_kwargs": {"max_steps": 9}}
+    joined = manager._applicable(drawn, {"dynamics_kwargs": {"hidden": (8,), "max_steps": 5}})
+    assert joined == {"rollout_start": "mix", "dynamics_kwargs": {"hidden": (8,), "max_steps": 9}}
+    assert manager._applicable({"rollout_start": "mix"}, {"dynamics": "physical"}) == {}
+
+
+def test_an_environments_module_is_imported_where_it_runs(zoo, tmp_path, monkeypatch):
+    (tmp_path / "faraway.py").write_text(
+        "import gymnasium as gym\n"
+        "from gymnasium.envs.classic_control import PendulumEnv\n"
+        "gym.register('faraway/Pendulum-v0', 'faraway:PendulumEnv', max_episode_steps=20)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    importlib.import_module("faraway")
+    worlds = ["--source-env", "faraway/Pendulum-v0", "--eval-env-kwargs", "g:12.0", "--vec-env", "subproc"]
+    cold = ["-n", "4", "--source-timesteps", "40", "--eval-freq", "-1", *SMALL, "policy_kwargs:dict(net_arch=[16])"]
+    run = launch(tmp_path, "rpo", *worlds, *cold, "n_envs:2", env="faraway/Pendulum-v0")
+    assert RPO.load(final(run), device="cpu").num_timesteps == 4
+
+
 @pytest.mark.parametrize("place", ["vecnormalize.pkl", "{source}/vecnormalize.pkl", "sac/vecnormalize.pkl"])
 def test_a_source_agent_brings_its_statistics_along(zoo, agent, tmp_path, place):
     from sb3_rpto.zoo.manager import Start, TransferManager
@@ -275,6 +326,7 @@ def test_a_source_agent_brings_its_statistics_along(zoo, agent, tmp_path, place)
     path.parent.mkdir(parents=True, exist_ok=True)
     seen.save(str(path))
     manager = TransferManager.__new__(TransferManager)
+    manager.normalize = False
     manager.trained_agent, manager.start = "", Start(SOURCE, str(tmp_path / "sac.zip"))
     assert manager._maybe_normalize(make_vec_env(SOURCE), False).obs_rms.mean.tolist() == [7.0] * 4
 

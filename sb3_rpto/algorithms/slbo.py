@@ -49,6 +49,7 @@ class SLBO(MBPO):
         "rollout_start": "source",
     }
     NUMBERS_OF_TASKS: ClassVar[dict[str, dict[str, Any]]] = {}
+    unused = MBPO.unused | {"gradient_steps", "source_steps", "real_ratio", "rollout_start"}
 
     def __init__(
         self,

@@ -51,10 +51,12 @@ def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
     """The source model itself, or from its zip.
 
     :raises TypeError: for a model of another kind
-    :raises ValueError: for a zip that SAC cannot load
+    :raises ValueError: for a zip that SAC cannot load, and for SLBO
     :raises FileNotFoundError: there is none
     """
     if isinstance(source_model, SAC):
+        if getattr(source_model, "trpo", None) is not None:
+            raise ValueError("source_model is an SLBO, which acts by TRPO's policy; its SAC has learned nothing since")
         return source_model
     if not isinstance(source_model, str | os.PathLike):
         raise TypeError(f"source_model must be a SAC or the path of its zip, not {type(source_model).__name__}")

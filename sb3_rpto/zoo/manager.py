@@ -86,6 +86,8 @@ class TransferManager(ExperimentManager):
             self.continue_training = True  # the zoo then asks _load_pretrained_agent for the model
         self._n_source_envs = 1
         self._asked = set(self.custom_hyperparams or {})
+        #: parameters of a trial of a search, with which the run is to train
+        self._drawn: dict[str, Any] = {}
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """As the zoo's; the folder of a run that could not begin is removed, lest ``enjoy`` takes it for the newest."""
@@ -112,6 +114,9 @@ class TransferManager(ExperimentManager):
             hyperparams, saved = super().read_hyperparameters()
         finally:
             self.env_name = env_name
+        drawn = _applicable(self._drawn, hyperparams)
+        for settings in (hyperparams, saved):
+            settings.update(drawn)
         if self.resumes and self.start is not None:
             had = config_beside(self.trained_agent)
             kept = {name: had[name] for name in OUTSIDE if name in had and name not in self._asked}
@@ -122,10 +127,16 @@ class TransferManager(ExperimentManager):
         return hyperparams, saved
 
     def load_trial(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """As the zoo's; a trial's parameters win over what a source agent brings along."""
+        """As the zoo's; a trial's parameters win over what a source agent brings along.
+
+        With two worlds they join the settings as in the search, :meth:`read_hyperparameters` sees to that.
+        """
         found = super().load_trial(*args, **kwargs)
         self._asked |= found.keys()
-        return found
+        if self.start is None:
+            return found
+        self._drawn = found
+        return {}
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         """As the zoo's; with two worlds ``n_envs`` is taken to be the source's, callbacks count target steps."""
@@ -165,7 +176,7 @@ class TransferManager(ExperimentManager):
     def _make(self, env_id: str, env_kwargs: dict[str, Any], n_envs: int = 1, monitor_dir: str | None = None) -> VecEnv:
         kind: Any = self.vec_env_class
         return make_vec_env(
-            partial(gym.make, env_id, **env_kwargs),
+            partial(gym.spec(env_id).make, **env_kwargs),  # a process of its own need not know the id
             n_envs=n_envs,
             seed=self.seed,
             monitor_dir=monitor_dir,
@@ -177,18 +188,26 @@ class TransferManager(ExperimentManager):
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
         """As the zoo's; the statistics of a checkpoint, or of a source agent, are those that were saved with it."""
-        candidates = [beside(self.trained_agent, "vecnormalize")]
-        if self.start is not None and self.start.source_model is not None and not self.trained_agent:
-            agent = Path(self.start.source_model)
-            candidates = [beside(str(agent), "vecnormalize")]
-            candidates += [agent.parent / name / "vecnormalize.pkl" for name in (self.start.source_env, agent.stem)]
+        agent, source = self.trained_agent, self.start.source_env if self.start is not None else None
+        if self.start is not None and self.start.source_model is not None and not agent:
+            agent = self.start.source_model
+        folders = [Path(agent).parent / name for name in (source, Path(agent).stem) if name] if agent else []
+        candidates = [beside(agent, "vecnormalize"), *(folder / "vecnormalize.pkl" for folder in folders)]
         statistics = next((path for path in candidates if path is not None and path.is_file()), None)
         if statistics is None:
             return super()._maybe_normalize(env, eval_env)
         env = VecNormalize.load(str(statistics), env)
+        if not self.normalize:  # no settings say so, but the agent's; the zoo saves statistics where it normalises
+            self.normalize, self.normalize_kwargs = True, {"norm_obs": env.norm_obs, "norm_reward": env.norm_reward}
         if eval_env:
             env.training = env.norm_reward = False
         return env
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        """As the zoo's, from which ``enjoy`` reads whether the agent's observations are normalised."""
+        if self.normalize:
+            saved_hyperparams.setdefault("normalize", self.normalize_kwargs or True)
+        super()._save_config(saved_hyperparams)
 
     # ------------------------------------------------------------------ models
 
@@ -264,7 +283,7 @@ class TransferManager(ExperimentManager):
         if start.source_model is None:
             return cls(env=source, **settings)
         sac = load_sac(start.source_model, self.device)
-        brought = {"policy", *carried_arguments(sac)} - set(asked)
+        brought = {"policy"} | carried_arguments(sac).keys() - set(asked)
         settings = {name: value for name, value in settings.items() if name not in brought}
         return cls.from_source(sac, source, source_data=start.source_data, **settings)
 
@@ -287,9 +306,9 @@ class TransferManager(ExperimentManager):
         except KeyboardInterrupt:  # what was learned is saved, and resumes
             pass
         finally:
-            if self.callbacks:  # the progress bar is the first
-                self.callbacks[0].on_training_end()
             _close(model)
+            if self.callbacks and hasattr(self.callbacks[0], "pbar"):  # a progress bar that was begun is the first
+                self.callbacks[0].on_training_end()
 
     # ------------------------------------------------------------------ search
 
@@ -302,9 +321,7 @@ class TransferManager(ExperimentManager):
         if self.start is None:
             return super().objective(trial)
         sampled = SAMPLERS[self.algo](trial, self.n_actions, self._n_source_envs, {})
-        merged = {**self._hyperparams, **sampled}
-        if "dynamics_kwargs" in sampled:
-            merged["dynamics_kwargs"] = {**self._hyperparams.get("dynamics_kwargs", {}), **sampled["dynamics_kwargs"]}
+        merged = {**self._hyperparams, **_applicable(sampled, self._hyperparams)}
         source, target = self.create_envs(1, no_log=True), self.create_target(no_log=True)
         evaluation = self.create_envs(self.n_eval_envs, eval_env=True)
         folder = None
@@ -348,6 +365,16 @@ def beside(trained_agent: str, kind: str) -> Path | None:
     if stem.startswith("rl_model_") and stem.endswith("_steps"):
         return path.with_name(f"rl_model_{kind}_{stem.removeprefix('rl_model_')}.pkl")
     return path.with_name(f"pretrain_{kind}.pkl" if stem == "pretrain" else f"{kind}.pkl")
+
+
+def _applicable(drawn: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
+    """What a search has drawn, as it joins settings: part of the model's arguments, nothing that the model has not."""
+    found = dict(drawn)
+    if "dynamics_kwargs" in found:
+        found["dynamics_kwargs"] = {**settings.get("dynamics_kwargs", {}), **found["dynamics_kwargs"]}
+    if settings.get("dynamics") == "physical":  # it has no branches
+        found.pop("rollout_start", None)
+    return found
 
 
 def config_beside(trained_agent: str) -> dict[str, Any]:

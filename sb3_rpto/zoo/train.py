@@ -133,6 +133,8 @@ def _start(parser: argparse.ArgumentParser, ours: argparse.Namespace, rest: list
         parser.error("-optimize needs --source-model: without it, every trial would first train an agent in the source")
     if ours.source_model is not None and theirs.trained_agent:
         parser.error("--source-model begins a run and -i goes on with one; leave one of them out")
+    if ours.source_data is not None and ours.source_model is None:
+        parser.error("--source-data spares collecting with --source-model: pass that, too, or leave it out")
     seed = theirs.seed if theirs.seed >= 0 else None  # as the zoo has it
     return Start(source, ours.source_model, ours.source_data, ours.source_timesteps, seed)
 

@@ -20,6 +20,10 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms.mbpo import MBPO
+from sb3_rpto.algorithms.pdml import PDML
+from sb3_rpto.algorithms.ptp import PTP
+from sb3_rpto.algorithms.slbo import SLBO
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.buffers import chronological
 from sb3_rpto.callbacks import KeepBest
@@ -374,6 +378,36 @@ def test_files_and_arguments_that_load_cannot_take_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"m.zip is no replay buffer; pass what save_replay_buffer\(\) wrote"):
         model.load_replay_buffer(tmp_path / "m.zip")
     assert model.replay_buffer is kept
+
+
+@pytest.mark.parametrize("saves", [RPTO, MBPO, PTP, SLBO])
+def test_a_checkpoint_goes_on_with_its_own_class(saves, tmp_path):
+    class Mine(saves):
+        """Of a user: a checkpoint of its parent is one of its own."""
+
+    small(saves).save(tmp_path / "m")
+    for loads in (RPO, RTO, RPTO, MBPO, PTP, PDML, SLBO, Mine):
+        if loads in (saves, Mine) or {loads, saves} == {RTO, RPTO}:
+            assert isinstance(loads.load(tmp_path / "m"), loads)
+        else:
+            with pytest.raises(ValueError, match=f"was saved by .*{saves.__name__}, {loads.__name__} cannot"):
+                loads.load(tmp_path / "m")
+
+
+@pytest.mark.parametrize(
+    ("cls", "given", "message"),
+    [
+        (PTP, {"n_candidates": 0}, "n_candidates must be at least 1"),
+        (PDML, {"newest_share": 1.0}, "newest_share must lie in"),
+        (SLBO, {"iterations": 0}, "iterations must be at least 1"),
+        (SLBO, {"rollout_samples": 101}, "is no multiple of rollout_length"),
+        (MBPO, {"weighting": "paper"}, r"MBPO does not use \['weighting'\]"),
+    ],
+)
+def test_a_baselines_numbers_are_checked_when_it_is_loaded(cls, given, message, tmp_path):
+    small(cls).save(tmp_path / "m")
+    with pytest.raises(ValueError, match=message):
+        cls.load(tmp_path / "m", **given)
 
 
 def test_a_source_phase_goes_on_with_its_statistics(tmp_path, monkeypatch):

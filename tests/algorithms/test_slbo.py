@@ -5,8 +5,11 @@ import pytest
 import torch as th
 from conftest import pendulum, small
 from stable_baselines3 import SAC
+from stable_baselines3.common.logger import configure
 
+from sb3_rpto import RPO
 from sb3_rpto.algorithms.slbo import SLBO
+from sb3_rpto.callbacks import RelativityGapCallback
 from sb3_rpto.dynamics.deterministic import DeterministicDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
 
@@ -52,6 +55,39 @@ def test_rollouts_are_the_models_from_initial_states_of_the_source_cut_off(monke
     assert (rollouts.num_envs, rollouts.max_episode_steps) == (2, 20)
     starts = rollouts.reset()
     assert np.abs(starts[:, 2]).max() <= 1.0  # where Pendulum's episodes begin
+
+
+def test_before_learning_it_acts_as_its_teacher():
+    model = slbo()
+    expected = SAC.predict(model, STATES, deterministic=True)[0]
+    np.testing.assert_array_equal(model.predict(STATES, deterministic=True)[0], expected)
+    model.learn(1, source_timesteps=0)
+    assert (model.predict(STATES, deterministic=True)[0] != expected).any()
+
+
+def test_what_it_does_not_use_is_refused():
+    for name, value in (("gradient_steps", 5), ("source_steps", 9), ("real_ratio", 0.5), ("rollout_start", "target")):
+        with pytest.raises(ValueError, match=f"SLBO does not use \\['{name}'\\]"):
+            slbo(**{name: value})
+
+
+def test_its_sac_is_no_source_model():
+    with pytest.raises(ValueError, match="is an SLBO, which acts by TRPO's policy"):
+        RPO.from_source(slbo(), pendulum(), pendulum(12.0))
+
+
+def test_its_gap_is_not_that_of_sacs_policy():
+    with pytest.raises(TypeError, match="SLBO acts by TRPO's"):
+        slbo().learn(1, RelativityGapCallback(), source_timesteps=0)
+
+
+def test_with_a_log_stages_are_logged(tmp_path):
+    recorded = SAC("MlpPolicy", pendulum(12.0), learning_starts=100, seed=0, device="cpu").learn(60).replay_buffer
+    settings = {"policy_kwargs": {"net_arch": [16]}, "dynamics_kwargs": {"hidden": (16,)}, "device": "cpu"}
+    model = SLBO("MlpPolicy", pendulum(), target_data=recorded, **settings, **STAGE)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(10, source_timesteps=0)
+    assert "slbo/policy_objective" in (tmp_path / "progress.csv").read_text().splitlines()[0]
 
 
 def test_before_the_first_stage_it_acts_as_the_sac_that_it_came_from():
