@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SUFFIXES = (".png", ".pdf", ".svg")
+#: Beside its settings, what makes a run another method's.
+BEGUN_WITH = ("source", "episodes")
 
 DESCRIPTION = """\
 Draw learning curves of result files: one panel a target, one line a method, the
@@ -99,7 +101,17 @@ def _labelled(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         names = sorted({name for other in others for name in {*own, *other} if own.get(name) != other.get(name)})
         label = " ".join([row["method"], *(f"{name}={own.get(name, 'default')}" for name in names)])
         found.append({**row, "method": label})
-    return found
+    return _told_apart(found)
+
+
+def _told_apart(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows with the source agent in the name of a method of which one seed has runs from several."""
+    runs: dict[tuple[str, str, int], set[str]] = {}
+    for row in rows:
+        runs.setdefault((row["target"], row["method"], row["seed"]), set()).add(row["agent"])
+    several = {(target, method) for (target, method, _), agents in runs.items() if len(agents) > 1}
+    apart = [(row["target"], row["method"]) in several for row in rows]
+    return [{**row, "method": f"{row['method']} agent={row['agent']}"} if a else row for row, a in zip(rows, apart)]
 
 
 def _result(file: Path) -> list[dict[str, Any]] | None:
@@ -113,15 +125,19 @@ def _result(file: Path) -> list[dict[str, Any]] | None:
         else:
             of_run = {name: content["config"][name] for name in ("method", "target", "seed")}
         of_run["settings"] = _chosen(content.get("config", {}))
+        if content.get("error"):
+            print(f"sb3-rpto: left out, failed: {file}", file=sys.stderr)
+        of_run["agent"] = str(content.get("config", {}).get("source_model_sha256"))[:8]
         return [{**of_run, "steps": row["steps"], "return": row["return"]} for row in content["rows"]]
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
 def _chosen(config: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a run but a buffer as long as the run, which the command made so."""
+    """The settings of a run but a buffer as long as the run, which the command made so, and what it began with."""
     settings = config.get("settings", {})
-    return {n: value for n, value in settings.items() if n != "buffer_size" or value != config.get("steps")}
+    chosen = {n: value for n, value in settings.items() if n != "buffer_size" or value != config.get("steps")}
+    return chosen | {name: config[name] for name in BEGUN_WITH if config.get(name) is not None}
 
 
 def draw(axes: Any, rows: pd.DataFrame, title: str) -> None:
@@ -135,6 +151,7 @@ def draw(axes: Any, rows: pd.DataFrame, title: str) -> None:
 
     for method, lines in summarise(rows, ["method", "steps"]).groupby("method", sort=True):
         seeds = lines["seeds"].max()
+        lines = lines[lines["seeds"] == seeds]  # where some were not evaluated, the others would draw a jump
         label = f"{method} ({seeds})"
         if len(lines) == 1:  # zero-shot
             axes.axhline(lines["iqm"].iloc[0], color="grey", linestyle="--", label=label)

@@ -67,6 +67,7 @@ def run(parsed: argparse.Namespace) -> int:
     """Transfer, or go on with it."""
     from sb3_rpto.commands.runs import RunFolder, SavedCurve, beside
     from sb3_rpto.experiments.methods import REGISTRY, Run
+    from sb3_rpto.experiments.sources import digest
     from sb3_rpto.files import write_atomically
     from sb3_rpto.zoo.settings import ALGORITHMS, shipped_settings
 
@@ -93,6 +94,7 @@ def run(parsed: argparse.Namespace) -> int:
         "seed": parsed.seed,
         "settings": settings,
         "source_model": beside(parsed.out, parsed.source_model),
+        "source_model_sha256": digest(parsed.source_model),
         "source_data": beside(parsed.out, parsed.source_data),
         "every": every,
         "episodes": parsed.episodes,

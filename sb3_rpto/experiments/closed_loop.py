@@ -24,7 +24,7 @@ from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments import sources
 from sb3_rpto.experiments.provenance import commit
 from sb3_rpto.experiments.randomised import randomised_agent
-from sb3_rpto.experiments.report import enough, iqm_interval, steps_to
+from sb3_rpto.experiments.report import enough, steps_to, stratified_interval
 from sb3_rpto.experiments.run import transfer
 from sb3_rpto.files import write_json
 
@@ -295,7 +295,7 @@ def oracle(task: str, shift: str, target: int, folder: Path, steps: int = ORACLE
     :param steps: target steps
     """
     path = folder / f"oracle_{task}_{shift}_{target}.json"
-    if not path.exists():
+    if not path.exists() or json.loads(path.read_text())["steps"] != steps:
         th.set_num_threads(1)
         agent, _ = source_agent(task, folder)
         rows = transfer(
@@ -331,14 +331,15 @@ def summary(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float]) -> p
 
     :param rows: of :func:`collected`
     :param oracles: return of the oracle of each (task, shift, target)
-    :return: IQM of the return with its 95 % interval, of the share of the oracle's, runs, updates and source steps per
-        target step, seconds, median errors of the source, the model and its parameters, verdicts
+    :return: IQM of the return with its 95 % interval, for which each target's runs are resampled for themselves, mean
+        share of the oracle's, runs, updates and source steps per target step, seconds, median errors of the source, the
+        model and its parameters, verdicts
     """
     best = pd.Series([oracles.get(key, np.nan) for key in zip(rows.task, rows["shift"], rows.target)], rows.index)
     rows = rows.assign(share=rows["return"] / best)
     lines = []
     for key, part in rows.groupby(["task", "shift", "method", "steps"], sort=False):
-        middle, low, high = iqm_interval(part["return"].to_numpy())
+        middle, low, high = stratified_interval([of["return"].to_numpy() for _, of in part.groupby("target")])
         steps = max(int(key[3]), 1)
         line = dict(zip(("task", "shift", "method", "steps"), key))
         line |= {"runs": len(part), "iqm": middle, "low": low, "high": high, "share": part["share"].mean()}

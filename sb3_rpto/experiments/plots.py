@@ -41,6 +41,7 @@ def learning_curves(
     axes = figure.subplots(len(tasks), columns, squeeze=False)
     others = [label for label in labels if label not in ours]
     colours = dict(zip(others, colormaps["tab20"](np.arange(len(others)) % 20)))
+    dashed = others[20:]  # the palette begins anew
     colours |= dict(zip(ours, ("black", "crimson", "royalblue", "darkorange") * (len(ours) // 4 + 1)))
     for row, task in zip(axes, tasks):
         for axis, target in zip(row, targets[task]):
@@ -49,7 +50,8 @@ def learning_curves(
                 curve = here[here["label"] == label].sort_values("steps")
                 front = label in ours
                 style = {"color": colours[label], "zorder": 3 if front else 2}
-                axis.plot(curve["steps"], curve["return"], label=label, linewidth=2.2 if front else 1.0, **style)
+                form = {"linewidth": 2.2 if front else 1.0, "linestyle": "--" if label in dashed else "-"}
+                axis.plot(curve["steps"], curve["return"], label=label, **form, **style)
                 band = (curve["steps"], curve["return_low"], curve["return_high"])
                 axis.fill_between(*band, alpha=0.18 if front else 0.07, linewidth=0, **style)
             known = references.get(f"{task}_{target}", {})

@@ -169,8 +169,8 @@ def costs(rows: pd.DataFrame, references: Mapping[str, Mapping[str, float]]) -> 
         model was learned
     :param references: as :func:`scored` takes them
     :return: columns task, target, label, runs, budget, updates, source_steps, seconds (the last three for each target
-        step), model_error (median at the end; NaN without a model), reached (runs that did), steps_to (median of the
-        first evaluations that did; infinite where half did not)
+        step, from the first one on), model_error (median at the end; NaN without a model), reached (runs that did),
+        steps_to (median of the first evaluations that did; infinite where half did not)
     """
     lines = []
     for (task, target, label), part in rows.groupby([*PLACE, "label"], sort=False):
@@ -178,7 +178,9 @@ def costs(rows: pd.DataFrame, references: Mapping[str, Mapping[str, float]]) -> 
         last = part[part["steps"] == budget]
         line: dict[str, Any] = {"task": task, "target": target, "label": label, "runs": part["seed"].nunique()}
         line |= {"budget": budget}
-        line |= {name: float(last[name].mean()) / max(budget, 1) for name in ("updates", "source_steps", "seconds")}
+        begun = part[part["steps"] == 0]  # of updates and seconds nothing
+        for name in ("updates", "source_steps", "seconds"):
+            line[name] = float(last[name].mean() - begun[name].mean()) / max(budget, 1)
         line["model_error"] = float(last["model_error"].median()) if "model_error" in last else np.nan
         best = references.get(f"{task}_{target}", {}).get("oracle", np.nan)
         reached = [steps_to(one, enough(best)) for _, one in part.groupby("seed")]

@@ -134,10 +134,12 @@ def run(
         measure = partial(_reference, agents=agents, folder=folder / "sources")
         measured = _prepared("oracle", side_by_side(measure, targets), len(targets))
         references = known.get("references", {}) | measured
-        manifest = {**_about(suite, seeds), "references": references, "versions": versions(), "commit": commit()}
-        write_json(folder / "manifest.json", {**manifest, **machine()})
         tasks = [Task(job, *agents[job.task], str(folder / "runs")) for job in listed]
         pending = [task for task in tasks if stored(task) is None]
+        about = {**_about(suite, seeds), "references": references}
+        about["planned"] = max(about["planned"], known.get("planned", 0))
+        ran = {"versions": versions(), "commit": commit(), **machine()} if pending or not known else {}
+        write_json(folder / "manifest.json", {**known, **about, **ran})
         say = _Progress([task.job for task in pending], workers)
         for result in side_by_side(work, pending):
             say(result)

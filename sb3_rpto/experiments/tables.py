@@ -81,23 +81,28 @@ def load(folder: str | os.PathLike[str]) -> Study:
     """Read a suite's results; unfinished ones will do.
 
     :raises FileNotFoundError: no manifest
-    :raises ValueError: no run is done
+    :raises ValueError: no run is done, or a torn manifest
     """
     path = Path(folder) / "manifest.json"
     if not path.is_file():
         raise FileNotFoundError(
             f"{folder} has no manifest.json; run 'sb3-rpto benchmark transfer --out {folder}' first"
         )
-    manifest = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(
+            f"{path} is torn ({error}); run 'sb3-rpto benchmark transfer' again with that --out"
+        ) from error
     rows: list[dict[str, Any]] = []
     failed, left_out, commits = {}, [], set()
     for file in sorted((Path(folder) / "runs").glob("*.json")):
         try:
             result = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError:  # torn: the next sweep makes it again
+            job = result["job"]
+        except (ValueError, TypeError, KeyError):  # torn: the next sweep makes it again
             failed[file.stem] = "torn file"
             continue
-        job = result["job"]
         reference = manifest["references"].get(f"{job['task']}_{job['target']}", {})
         if result["error"]:
             failed[result["name"]] = result["error"].strip().splitlines()[-1]

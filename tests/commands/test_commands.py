@@ -20,7 +20,7 @@ from stable_baselines3.common.save_util import load_from_pkl
 from sb3_rpto import RPO, RPTO, cli
 from sb3_rpto.algorithms.slbo import SLBO
 from sb3_rpto.commands import enjoy, options, video
-from sb3_rpto.commands.plot import read_rows
+from sb3_rpto.commands.plot import draw, read_rows
 from sb3_rpto.commands.policies import load_policy
 from sb3_rpto.commands.runs import RunFolder, SavedCurve
 from sb3_rpto.experiments.report import summarise
@@ -330,6 +330,17 @@ def test_wrong_input_is_one_line_before_the_work(
     assert (tmp_path / "foreign" / "model.zip").read_text() == "somebody's"
 
 
+def test_a_run_of_another_source_agent_is_another_run(
+    agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = shutil.copytree(agent, tmp_path / "source")
+    assert transfer(source, tmp_path / "out", "rpo") == 0
+    SAC("MlpPolicy", gym.make(SOURCE), policy_kwargs={"net_arch": [16]}, device="cpu").save(source / "model.zip")
+    capsys.readouterr()
+    assert transfer(source, tmp_path / "out", "rpo") == 2
+    assert "holds a run with source_model_sha256=" in error(capsys)
+
+
 def test_a_corrected_command_may_use_the_folder(agent: Path, tmp_path: Path) -> None:
     assert transfer(agent, tmp_path, "rpto", "--set", "weighting=papre") == 2
     assert transfer(agent, tmp_path, "rpto", "--set", "weighting=centred") == 0
@@ -386,6 +397,32 @@ def test_enjoy_runs_policies_of_other_algorithms(kind: str, tmp_path: Path) -> N
     assert found == pytest.approx(total, rel=1e-5)
 
 
+#: Of a run of the benchmark that failed.
+NOTHING = {"target": {"id": TARGET, "shift": ""}, "rows": []}
+
+
+def test_plot_tells_source_agents_apart_where_seeds_do_not(tmp_path: Path) -> None:
+    def finished(name: str, seed: int, agent: str, **more: object) -> Path:
+        config = {"method": "rpto", "target": TARGET, "seed": seed, "source_model_sha256": agent * 8, **more}
+        (tmp_path / f"{name}.json").write_text(json.dumps({"config": config, "rows": [{"steps": 20, "return": 1.0}]}))
+        return tmp_path / f"{name}.json"
+
+    each = [finished("a", 0, "aa"), finished("b", 1, "bb")]  # of each seed an agent of its own
+    assert {row["method"] for row in read_rows(each)} == {"rpto"}
+    both = [*each, finished("c", 0, "cc")]
+    assert {row["method"] for row in read_rows(both)} == {f"rpto agent={name * 4}" for name in ("aa", "bb", "cc")}
+    judged = [*each, finished("d", 2, "dd", episodes=3)]
+    assert {row["method"] for row in read_rows(judged)} == {"rpto episodes=default", "rpto episodes=3"}
+
+
+def test_a_line_is_of_the_same_runs_from_end_to_end() -> None:
+    matplotlib = pytest.importorskip("matplotlib.figure", reason="the extra 'experiments' is not installed")
+    rows = pd.DataFrame([("rpto", seed, steps, 1.0) for seed in (0, 1) for steps in (0, 200 + 100 * seed, 600)])
+    axes = matplotlib.Figure().subplots()
+    draw(axes, rows.set_axis(["method", "seed", "steps", "return"], axis=1), "")
+    assert axes.lines[0].get_xdata().tolist() == [0, 600]
+
+
 def test_plot_counts_seeds_and_tells_settings_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def finished(name: str, seed: int, **settings: object) -> Path:
         config = {"method": "rpto", "target": TARGET, "seed": seed, "settings": settings}
@@ -408,6 +445,10 @@ def test_plot_counts_seeds_and_tells_settings_apart(tmp_path: Path, capsys: pyte
         config = {"method": "sac", "target": TARGET, "seed": steps, "steps": steps, "settings": {"buffer_size": steps}}
         (tmp_path / f"{steps}.json").write_text(json.dumps({"config": config, "rows": [{"steps": 20, "return": 1.0}]}))
     assert {row["method"] for row in read_rows([tmp_path / "60.json", tmp_path / "80.json"])} == {"sac"}
+    capsys.readouterr()
+    (tmp_path / "failed.json").write_text(json.dumps({"job": {"label": "x", "seed": 0}, "error": "E", **NOTHING}))
+    read_rows([*files, tmp_path / "failed.json"])
+    assert capsys.readouterr().err == f"sb3-rpto: left out, failed: {tmp_path / 'failed.json'}\n"
     twice = pd.DataFrame([*read_rows(files[:2]), *read_rows(files[:1])])
     assert summarise(twice, ["method", "steps"])["seeds"].tolist() == [2]
 

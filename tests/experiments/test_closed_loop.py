@@ -92,6 +92,22 @@ def test_summary_says_what_was_spent_for_what() -> None:
     assert table.loc[0, "runs"] == 3
 
 
+def test_how_targets_differ_is_not_how_runs_do() -> None:
+    better = rows().assign(target=1, **{"return": lambda table: table["return"] + 10_000})
+    line = study.summary(pd.concat([rows(), better]), {}).set_index("steps").loc[0]
+    assert line["low"] == line["iqm"] == line["high"]  # all runs of a target begin alike
+
+
+def test_an_oracle_of_other_steps_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = tmp_path / "oracle_hopper_none_0.json"
+    kept.write_text(json.dumps({"return": 7.0, "steps": 10}))
+    monkeypatch.setattr(study, "source_agent", lambda *_: ("agent.zip", None))
+    monkeypatch.setattr(study, "transfer", lambda *_, **__: [{"return": 1.0}, {"return": 9.0}])
+    assert study.oracle("hopper", "none", 0, tmp_path, steps=10) == 7.0
+    assert study.oracle("hopper", "none", 0, tmp_path, steps=20) == 9.0
+    assert json.loads(kept.read_text()) == {"return": 9.0, "steps": 20}
+
+
 def test_steps_to_a_share_of_the_oracle() -> None:
     line = study.steps_to_oracle(rows(), {("hopper", "none", 0): 760.0}).iloc[0]
     # 684 is reached at once by the third seed alone.
@@ -168,7 +184,7 @@ def test_finished_runs_are_not_repeated_and_are_collected(tmp_path: Path) -> Non
     job = study.Job("double-pendulum", "none", 0, "zero-shot", 0)
     path = tmp_path / f"{job.name}.json"
     path.write_text(json.dumps([{"task": "double-pendulum", "return": 1.0, "steps": 0}]))
-    (tmp_path / "oracle_double-pendulum_none_0.json").write_text(json.dumps({"return": 2.0}))
+    (tmp_path / "oracle_double-pendulum_none_0.json").write_text(json.dumps({"return": 2.0, "steps": 100_000}))
     assert study.run(job, tmp_path) == path
     assert study.oracle("double-pendulum", "none", 0, tmp_path) == 2.0
     assert study.oracles(tmp_path) == {("double-pendulum", "none", 0): 2.0}

@@ -74,8 +74,14 @@ def test_finished_runs_are_not_repeated_and_torn_failed_or_other_ones_are(tmp_pa
     assert returns(again) == returns(first)
 
     worked.clear()
-    sweep.run(SUITE, tmp_path, workers=1)
+    ran = {"commit": "the one that ran", "versions": {"torch": "1.0"}}
+    manifest = tmp_path / "manifest.json"
+    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), **ran}))
+    sweep.run(SUITE, tmp_path, workers=1, seeds=1)
     assert worked == []
+    known = json.loads(manifest.read_text())
+    assert {name: known[name] for name in ran} == ran
+    assert known["planned"] == len(jobs(SUITE))
     longer = replace(SUITE, places=(replace(PLACE, points=(10, 30), oracle_steps=PLACE.oracle_steps),))
     sweep.run(longer, tmp_path, workers=1, only="sac-warm_1")
     assert worked == ["ContinuousCartPole_limb-x2_sac-warm_1"]

@@ -532,6 +532,15 @@ def test_several_workers(traced, tmp_path, monkeypatch):
     assert [r["case"]["id"] for r in results] == [case.id for case in design("quick")]
 
 
+def test_a_part_that_is_traced_again_leaves_the_rest_in_the_table(traced, tmp_path, capsys):
+    common = ["--out", str(tmp_path), "--scale", "quick", "--workers", "1"]
+    assert tracing_benchmark.main([*common, "--only", "^single"]) == 0
+    singles = len(traced)
+    assert tracing_benchmark.main([*common, "--only", "^complete"]) == 0
+    assert f"{len(traced)} of {len(traced)} generated sets traced" in capsys.readouterr().out
+    assert len((tmp_path / "cases.csv").read_text().splitlines()) == 1 + len(traced) > 1 + singles
+
+
 def test_command(traced, tmp_path, capsys):
     arguments = ["--out", str(tmp_path), "--scale", "quick", "--workers", "1", "--only", "^complete-pendulum-1mrad$"]
     assert tracing_benchmark.main(arguments) == 0

@@ -149,6 +149,25 @@ def test_costs_and_the_first_step_at_ninety_percent(folder: Path) -> None:
     assert table.loc[("Ant", "rpto-x"), "reached"] == 0
 
 
+def test_what_came_before_the_first_target_step_is_no_cost_of_one(folder: Path) -> None:
+    for file in (folder / "runs").glob("*rpto-x*"):
+        made = json.loads(file.read_text())
+        for row in made["rows"]:
+            row["source_steps"] += 5_000  # phi_0's
+        file.write_text(json.dumps(made))
+    table = report.costs(tables.load(folder).rows, REFERENCES).set_index(["task", "label"])
+    assert table.loc[("Hopper", "rpto-x"), "source_steps"] == 2
+
+
+@pytest.mark.parametrize("torn", ["null", "[]", "{", "{}"])
+def test_torn_files_are_told(folder: Path, torn: str) -> None:
+    (folder / "runs" / "torn.json").write_text(torn)
+    assert tables.load(folder).failed == {"torn": "torn file"}
+    (folder / "manifest.json").write_text("{")
+    with pytest.raises(ValueError, match=r"manifest.json is torn .*; run 'sb3-rpto benchmark transfer'"):
+        tables.load(folder)
+
+
 def test_first_on_how_many_targets(folder: Path) -> None:
     table = report.firsts(report.curves(tables.load(folder).rows)).set_index(["label", "steps"])
     assert table["first"].to_dict() == {

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 from sb3_rpto.experiments.tracing_benchmark.design import SCALES, Case, design
-from sb3_rpto.experiments.tracing_benchmark.run import run, selected
+from sb3_rpto.experiments.tracing_benchmark.run import run, selected, stored
 from sb3_rpto.experiments.tracing_benchmark.score import score
 from sb3_rpto.experiments.tracing_benchmark.table import table, write
 
@@ -43,17 +44,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_benchmark(out: str, scale: str, workers: int | None, resume: bool, only: str | None = None) -> int:
-    """Trace what has no result yet, then write and print the table of all that has one.
+    """Trace what has no result yet, then write and print the table of all that has one, of earlier calls too.
 
     :param out: folder for ``table.md``, ``summary.csv``, ``cases.csv``, ``manifest.json`` and ``cases/``
     :param scale: ``"quick"`` or ``"full"``
     :param workers: processes; None: one a core
     :param resume: False: trace again what has a result already
-    :param only: regular expression that a case's id must match somewhere
+    :param only: regular expression that the id of a case to trace must match somewhere
     :return: exit code, 0: a table that shows failures is a result
     :raises ValueError: nothing matches, or a setting out of range
     """
-    results = run(out, scale, workers, only, resume)
+    run(out, scale, workers, only, resume)
+    asked, folder = {case.id for case in selected(scale, only)}, Path(out) / "cases"
+    found = {case.id: result for case in design(scale) if (result := stored(folder, case)) is not None}
+    cases = [case for case in design(scale) if case.id in asked or case.id in found]
     command = f"{NAME} --scale {scale}" + (f" --only '{only}'" if only else "")
-    print(write(out, results, selected(scale, only), command))
+    print(write(out, list(found.values()), cases, command))
     return 0
