@@ -116,12 +116,13 @@ def _told_apart(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _result(file: Path) -> list[dict[str, Any]] | None:
     """The rows of a file of ``sb3-rpto transfer``, ``train`` or ``benchmark transfer``; None for another file."""
+    from sb3_rpto.envs.tasks import env_id
+
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         if "job" in content:  # of the benchmark: a method with its settings has a label
-            of_run = {"method": content["job"]["label"], "target": content["target"]["id"]}
-            of_run["target"] += f" {content['target']['shift']}"
-            of_run["seed"] = content["job"]["seed"]
+            shifted = env_id(content["job"]["task"], content["target"]["shift"])  # as of ``transfer``
+            of_run = {"method": content["job"]["label"], "target": shifted, "seed": content["job"]["seed"]}
         else:
             of_run = {name: content["config"][name] for name in ("method", "target", "seed")}
         of_run["settings"] = _chosen(content.get("config", {}))
