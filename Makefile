@@ -26,7 +26,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 test: setup lint
 	$(PYTEST) -m "not slow"
 
-# The slow ones too: traces of whole machines, a third of the time of all tests.
+# The slow ones too: whole traces and runs beside quicker tests of the same code, more than half of the time of all tests.
 test-all: setup lint
 	$(PYTEST)
 

@@ -43,7 +43,14 @@ def prose(page: Path) -> str:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("page", [page for page in PAGES if runnable(page)], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page.name, marks=pytest.mark.slow if page.name == "tracing.md" else ())  # half a minute
+        for page in PAGES
+        if runnable(page)
+    ],
+)
 def test_code_blocks_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(EnsembleDynamics.__init__.__kwdefaults__, "hidden", (16, 16))
@@ -104,6 +111,7 @@ class Succeeds(gym.Wrapper):
         return *answer, {**info, "is_success": True}
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_every_logged_key_is_explained_and_every_explained_key_is_logged(tmp_path, monkeypatch):
     keys: set[str] = set()

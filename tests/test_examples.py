@@ -111,6 +111,7 @@ def test_robot_log_to_policy_draws_by_seed(monkeypatch):
     assert len({robot(seed)._inside[1].label for seed in range(12)}) == 3
 
 
+@pytest.mark.slow
 def test_close_the_loop_names_what_is_in_the_target(monkeypatch, tmp_path, capsys):
     transfer = load("transfer_double_pendulum", monkeypatch)
     example = load("close_the_loop", monkeypatch)

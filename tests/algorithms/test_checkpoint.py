@@ -115,7 +115,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+#: Others go through the same code.
+SLOW_CASES = ("rto-pendulum", "rpo-mujoco", "rpto-residual")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.slow if case in SLOW_CASES else ()) for case in CASES]
+)
 def test_resuming_equals_not_having_stopped(case, tmp_path):
     cls, source, target, kwargs = CASES[case]
 

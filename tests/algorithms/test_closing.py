@@ -453,6 +453,7 @@ def test_an_unstable_correction_is_refused(soon: None, monkeypatch: pytest.Monke
     assert not made.loop.accounts  # the simulator lacks what was found
 
 
+@pytest.mark.slow
 def test_what_does_not_lower_the_error_is_refused_and_the_simulator_judges_nothing(
     soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -493,6 +494,7 @@ def test_another_trace_is_due_when_new_transitions_are_no_longer_predicted(
     assert loop.due(made, dynamics(made))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("verdict", "due"), [("unexplained", True), ("partly explained", True), ("explained", False)])
 def test_what_was_not_explained_is_looked_for_again_in_twice_as_many_transitions(
     soon: None, verdict: str, due: bool
@@ -541,6 +543,7 @@ def test_a_later_explanation_takes_the_place_of_an_earlier_one() -> None:
     assert phi.names == ["pole.length", "coulomb_friction(slider).level"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forgotten", ["the oldest", "all, for it was not loaded"])
 def test_another_trace_is_due_though_transitions_are_forgotten(
     forgotten: str, soon: None, monkeypatch: pytest.MonkeyPatch
@@ -566,6 +569,7 @@ def test_a_small_memory_is_traced_when_it_is_full(soon: None) -> None:
     assert made.loop.due(made, dynamics(made))
 
 
+@pytest.mark.slow
 def test_learning_in_the_corrected_simulator_goes_on_where_it_was_interrupted(
     soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -956,6 +960,7 @@ def test_policies_are_rehearsed_on_the_way_where_much_is_owed(monkeypatch: pytes
     assert [n - updates for n in at] == [10, 20, 30, 34]
 
 
+@pytest.mark.slow
 def test_a_judged_policy_that_was_stopped_goes_on_as_if_it_had_not_been(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -215,6 +215,7 @@ def test_several_source_environments(cls):
     assert model.get_env().num_envs == 3
 
 
+@pytest.mark.slow
 def test_the_best_policy_is_kept_and_can_be_brought_back():
     model = small(RPO, gradient_steps=1)
     model.learn(1200, source_timesteps=0)

@@ -95,6 +95,7 @@ def test_noise_of_the_target_is_no_other_state():
     model(TransformObservation(target, lambda o: o + rng.normal(0, 0.05, o.shape), target.observation_space))
 
 
+@pytest.mark.slow
 def test_joints_in_another_order_are_doubted_once():
     made = model(Swapped(shifted()))
     with pytest.warns(UserWarning, match=r"one-step error is still .*model's joints in its order and units\?"):

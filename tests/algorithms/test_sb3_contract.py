@@ -44,9 +44,9 @@ from sb3_rpto.algorithms.transfer import TransferAlgorithm
 EPISODE = 10
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
-#: RTO runs the code that RPTO runs, less RPO's term.
+#: RTO runs the code that RPTO runs, less RPO's term; what SB3's own does changes with its version alone.
 OURS = [RPO, pytest.param(RTO, marks=pytest.mark.slow), RPTO]
-every_class = pytest.mark.parametrize("cls", [SAC, *OURS])
+every_class = pytest.mark.parametrize("cls", [pytest.param(SAC, marks=pytest.mark.slow), *OURS])
 ours = pytest.mark.parametrize("cls", OURS)
 pytestmark = pytest.mark.filterwarnings("ignore:EnsembleDynamics learns terminations")
 
@@ -764,6 +764,7 @@ class Restorable(Drift):
         self.place, self.steps = state[0].copy(), state[1]
 
 
+@pytest.mark.slow
 @ours
 @pytest.mark.parametrize("saved_at", [14, 20])
 @pytest.mark.parametrize("normalise", [False, True])

@@ -602,6 +602,7 @@ def test_long_log_keys_collide():
         stdout.write({long + "1": 1.0, long + "2": 2.0}, {long + "1": (), long + "2": ()})
 
 
+@pytest.mark.slow
 @ours
 def test_our_log_keys_are_short_and_lower_case(cls):
     model = (

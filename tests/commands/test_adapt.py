@@ -49,6 +49,7 @@ def adapt(given: Path, out: Path, *options: str, agent: str = "agent.zip", env: 
     return cli.main(["adapt", str(given / agent), env, str(given / log), "--out", str(out), *found])
 
 
+@pytest.mark.slow
 def test_a_log_becomes_a_report_a_simulator_and_a_policy(given: Path, tmp_path: Path, capsys) -> None:
     assert adapt(given, tmp_path) == 0
     said = capsys.readouterr().out

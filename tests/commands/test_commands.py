@@ -144,7 +144,10 @@ def test_every_kind_of_method_leaves_model_and_result(method: str, agent: Path, 
     assert loaded.shape == (1,)
 
 
-@pytest.mark.parametrize("method", ["rpo", "rpto", "slbo", "sac-mixed", "trpo-warm"])
+@pytest.mark.parametrize(
+    "method",
+    ["rpo", "rpto", "sac-mixed", *(pytest.param(name, marks=pytest.mark.slow) for name in ("slbo", "trpo-warm"))],
+)
 def test_a_killed_transfer_goes_on(
     method: str, agent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -128,7 +128,7 @@ def test_actions_of_another_size_are_refused():
 # --- the fit ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("env_id", "scale"), [(POLES, 0.3), (HOPPER, 1.0)])
+@pytest.mark.parametrize(("env_id", "scale"), [(POLES, 0.3), pytest.param(HOPPER, 1.0, marks=pytest.mark.slow)])
 def test_a_fit_finds_what_was_shifted(env_id, scale):
     data = collect(shifted(env_id), 100, scale=scale)
     model = dynamics(env_id)

@@ -97,6 +97,7 @@ def test_a_run_from_another_source_agent_is_made_again(made: Path, tmp_path: Pat
     assert sweep.stored(task) is None
 
 
+@pytest.mark.slow
 def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, worked: list[str], made: Path) -> None:
     """SIGKILL, when the first run is done and the second is under way."""
     program = f"""

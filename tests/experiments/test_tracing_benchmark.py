@@ -560,6 +560,7 @@ def test_command(traced, tmp_path, capsys):
             tracing_benchmark.main(["--out", str(tmp_path), *bad])
 
 
+@pytest.mark.slow
 def test_a_small_case_from_end_to_end():
     case = CASES["complete-pendulum-1mrad"]
     found = runner.examine(case, episodes=8, duration=2.5)

@@ -131,6 +131,7 @@ def test_the_interval_is_never_narrower_than_noise_alone_makes_it() -> None:
     assert found.ratio / found.high == pytest.approx(least, abs=0.01)
 
 
+@pytest.mark.slow
 def test_few_windows_of_noise_are_adequate() -> None:
     """Two blocks, resampled, can only be one, the other, or both."""
     p = complete(3)

@@ -27,6 +27,7 @@ def test_what_is_in_the_data_does_not_raise_the_threshold() -> None:
     assert needed(s, base.fit, [0, 1], seed=1) < 5
 
 
+@pytest.mark.slow
 def test_the_threshold_is_a_quantile_of_the_sets_and_no_less_than_that_of_a_test(monkeypatch) -> None:
     s = selector(0.0)
     base = s.model((), s.train.score(s.train.null)).fit

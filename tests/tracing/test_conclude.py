@@ -99,6 +99,7 @@ def transitions(source: gym.Env, target: gym.Env) -> Measurements:
     return Measurements.from_replay(agent.replay_buffer, source)
 
 
+@pytest.mark.slow
 def test_another_gravity_is_found_in_the_states_of_a_simulator_where_nothing_is_declared() -> None:
     source, target = gym.make("rpto/InvertedDoublePendulum-v0"), gym.make("rpto/InvertedDoublePendulum-gravity-x0.5-v0")
     report = trace(source, transitions(source, target), threads=1)

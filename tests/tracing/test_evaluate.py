@@ -83,6 +83,7 @@ def test_values_of_the_effects_are_used() -> None:
         assert a.rmse[0] < 1e-3 * b.rmse[0]
 
 
+@pytest.mark.slow
 def test_the_floor_is_the_error_of_the_true_model_on_noisy_data() -> None:
     simulation = Simulation(compiled(), [], 1)
     found, floor = [], []

@@ -250,6 +250,7 @@ def test_a_trace_of_noisy_states_names_what_is_missing() -> None:
     assert long - short < 0.05
 
 
+@pytest.mark.slow
 def test_a_trace_of_noisy_states_names_nothing_where_nothing_is_missing() -> None:
     env = gym.make(TASK)
     data = Measurements.from_replay(seen([], 150), env, noise=NOISE)

@@ -552,7 +552,9 @@ def test_velocity_against_position_is_reported(factor, kind):
     assert ("in degrees" in data.findings[0].message) == (factor > 0)
 
 
-@pytest.mark.parametrize("system", ["cartpole", "reacher", "arm3"])
+@pytest.mark.parametrize(
+    "system", ["cartpole", *(pytest.param(name, marks=pytest.mark.slow) for name in ("reacher", "arm3"))]
+)
 @pytest.mark.parametrize("setting", [{}, {"jitter": 0.5}, {"rate": 50.0}, {"quantum": 2 * np.pi / 4096}])
 def test_right_but_noisy_velocities_of_gentle_motion_have_no_finding(system, setting):
     """Noise of the differentiated position is no fault of the velocity."""

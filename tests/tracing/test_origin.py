@@ -62,6 +62,7 @@ def test_what_is_told_to_be_simulated_is_not_asked(monkeypatch: pytest.MonkeyPat
     assert "simulated" not in [f.kind for f in set_up.findings]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [0.0, 0.5])
 @pytest.mark.parametrize("velocities", [True, False])
 def test_a_simulator_that_was_logged_as_slowly_as_it_is_commanded_is_exact(offset: float, velocities: bool) -> None:

@@ -135,6 +135,7 @@ def test_actuators_whose_state_no_column_tells_are_refused(actuator: str, messag
         trace(machine(actuator), Measurements.from_tables({"a": table}), threads=1)
 
 
+@pytest.mark.slow
 def test_a_stiff_finger_is_integrated_implicitly_and_it_says_so() -> None:
     xml = machine('<position name="motor" joint="hinge" kp="1"/>', 'damping="0.1"', 'size=".005" mass="0.02"', 0.05)
     data = steps(xml, size=0.5)

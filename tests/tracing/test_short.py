@@ -48,6 +48,7 @@ def test_a_second_and_a_half_of_a_simulator_are_enough(late) -> None:
         assert found.effect.values == pytest.approx([STEP], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_test_runs_too_short_to_predict_are_told() -> None:
     whole = recorded()
     parts = ["train", "train", "train", "test"]

@@ -79,6 +79,7 @@ def test_ties_that_give_way_are_said_to() -> None:
         assert [f.where for f in soft_ties(mujoco.MjModel.from_xml_string(fingers.format(written)))] == places
 
 
+@pytest.mark.slow
 def test_finer_steps_are_not_taken_where_the_model_is_adequate(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SetUp, "finer", lambda *_: pytest.fail("nothing is missing"))
     model, rng, tables = mujoco.MjModel.from_xml_string(CRANK.format(friction="")), np.random.default_rng(0), {}

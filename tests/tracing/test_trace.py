@@ -93,6 +93,7 @@ def parted(data: Measurements, parts: Sequence[str]) -> Measurements:
 # --- verdicts ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_slow_actuator_is_found_with_its_time_constant() -> None:
     data = recorded([ActuatorLag("motor", time_constant=0.2)], compiled(COARSE), 8, 3.0, rate=100)
     report = traced_simply(data, kinds=["actuator_lag", "command_delay"])
@@ -102,6 +103,7 @@ def test_a_slow_actuator_is_found_with_its_time_constant() -> None:
     assert lag.alike == []
 
 
+@pytest.mark.slow
 def test_a_run_that_stalled_is_named_also_where_others_are_judged_on() -> None:
     data = few(9)
     data = parted(data, ["train"] * 5 + ["select"] * 2 + ["test"] * 2)
@@ -115,6 +117,7 @@ def test_a_run_that_stalled_is_named_also_where_others_are_judged_on() -> None:
     assert report.effects[0].interval[0, 0] < 0.08 < report.effects[0].interval[1, 0]
 
 
+@pytest.mark.slow
 def test_a_test_run_unlike_all_others_is_told_beside_the_verdict() -> None:
     data = simple()
     runs = simple_report().runs["test"]
@@ -127,6 +130,7 @@ def test_a_test_run_unlike_all_others_is_told_beside_the_verdict() -> None:
     assert not [f for f in simple_report().findings if f.kind == "missed"]
 
 
+@pytest.mark.slow
 def test_one_test_run_of_several_that_differs_is_named_alone() -> None:
     data = parted(few(9), ["train"] * 3 + ["select"] * 2 + ["test"] * 4)
     data.episodes[-1] = replace(data.episodes[-1], qpos=data.episodes[-1].qpos + 0.03)
@@ -269,6 +273,7 @@ def selected_on(report: Report) -> list[str]:
     return [f.message for f in report.findings if f.kind == "split" and "windows of the training runs" in f.message]
 
 
+@pytest.mark.slow
 def test_with_fewer_than_three_training_runs_blocks_are_selected_on_and_it_says_so() -> None:
     report = traced_simply(few(3))
     assert report.runs["select"] == []
@@ -318,6 +323,7 @@ def test_progress_goes_forward() -> None:
     assert shares[-1] < 1.0 + 1e-9
 
 
+@pytest.mark.slow
 def test_nothing_declared_and_no_candidates_is_a_check_of_the_model() -> None:
     report = traced_simply(recorded(model=compiled(COARSE), rate=100), [], declared=())
     assert report.verdict == "complete"
@@ -397,6 +403,7 @@ def driven(friction: float) -> tuple[gym.Env, Measurements]:
     return nominal, Measurements.from_replay(buffer, nominal)
 
 
+@pytest.mark.slow
 def test_what_an_environment_changed_of_its_file_is_saved(tmp_path: Path) -> None:
     env, data = driven(0.0)
     env.unwrapped.model.dof_damping[0] = 0.123
@@ -414,6 +421,7 @@ def test_an_unchanged_environment_is_complete_without_error() -> None:
     assert np.all(np.isnan(report.learnable))  # of rounding
 
 
+@pytest.mark.slow
 def test_of_numbers_that_only_show_together_the_last_stays_what_it_was() -> None:
     """A motor's gear and its gain, one of them beside friction that nobody declared."""
     env, data = driven(1.0)
@@ -428,6 +436,7 @@ def test_of_numbers_that_only_show_together_the_last_stays_what_it_was() -> None
     assert said == ["declared slide.gear", "declared slide.gain"]
 
 
+@pytest.mark.slow
 def test_dry_friction_that_an_environment_lacks_is_found() -> None:
     env, data = driven(1.0)
     report = trace(env, data, candidates=NATIVE, threads=1)
@@ -453,6 +462,7 @@ class Steps(InvertedDoublePendulumEnv):
         return super().step(self.gain * action)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gain", "push", "said"), [(2.0, 0.0, "gives the commands"), (1.0, 3.0, "moves otherwise")])
 def test_an_environment_that_does_more_than_its_model_is_told(gain: float, push: float, said: str) -> None:
     _, data = driven(0.0)
@@ -490,6 +500,7 @@ def test_how_test_runs_were_sampled_changes_nothing_of_the_fit() -> None:
     assert (ours.length, ours.longer, ours.scales) == (theirs.length, theirs.longer, theirs.scales)
 
 
+@pytest.mark.slow
 def test_declared_numbers_of_which_the_data_tell_nothing_are_named() -> None:
     rng, n = np.random.default_rng(0), 400
     still = {f"r{i}": {"time": np.arange(n) / RATE, "qpos.hinge": 1e-4 * rng.standard_normal(n)} for i in range(3)}
@@ -503,6 +514,7 @@ def test_declared_numbers_of_which_the_data_tell_nothing_are_named() -> None:
     assert "undetermined" not in {f.kind for f in moved.findings}
 
 
+@pytest.mark.slow
 def test_a_declared_number_that_ends_at_its_bound_is_named() -> None:
     light = COARSE.replace('mass="0.5"', 'mass="0.3"')  # where the machine has 0.5
     data = recorded(model=compiled(COARSE), rate=100)
@@ -582,6 +594,7 @@ def test_known_effects_that_cannot_be_are_refused_before_the_work(known: Any, sa
         trace(COARSE, simple(), ["hinge.damping"], known=known)
 
 
+@pytest.mark.slow
 def test_the_shape_of_a_known_effect_does_not_bend_to_what_is_missing() -> None:
     stribeck = LIBRARY["stribeck_friction"]
     true = stribeck("hinge", level=0.05, extra=0.1, speed=0.4)
