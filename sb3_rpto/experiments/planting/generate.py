@@ -1,5 +1,6 @@
 """Measurements of a machine with effects in it that nobody declared, and the truth about them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -102,8 +103,11 @@ def generate(
         ("quantum", quantum, quantum >= 0),
         ("zeros", zeros, zeros >= 0),
     ):
-        if not ok:
+        if not (ok and math.isfinite(value)):
             raise ValueError(f"{name} is {value}; see the ranges in the documentation of generate")
+    for effect in [effects] if isinstance(effects, str) else effects or ():
+        if not isinstance(effect, Plant) and (isinstance(effect, str) or len(effect) != 2):
+            raise ValueError(f"effects hold {effect!r}; give plants or pairs such as ('coulomb_friction', 'large')")
     plants = [e if isinstance(e, Plant) else draw(system, *e, seed) for e in effects or ()]
     kinds = [plant.kind for plant in plants]
     if len(set(kinds)) < len(kinds):
