@@ -9,6 +9,7 @@ import os
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -54,7 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (train.add, transfer.add, adapt.add, enjoy.add, plot.add, _add_trace, _add_benchmark):
         add(commands)
-    traceback = False
+    traceback, shown = False, warnings.formatwarning
+    warnings.formatwarning = lambda message, *_: f"sb3-rpto: warning: {message}\n"  # without a line of code
     try:
         parsed = parser.parse_args(arguments)
         traceback = parsed.traceback
@@ -69,6 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"sb3-rpto: error: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
         return BAD_INPUT
+    finally:
+        warnings.formatwarning = shown
 
 
 # --- trace ----------------------------------------------------------------------------------------------------------

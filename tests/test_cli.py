@@ -5,6 +5,7 @@ import io
 import json
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import mujoco
@@ -279,3 +280,18 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         cli.main(["--version"])
     assert capsys.readouterr().out == f"sb3-rpto {__version__}\n"
+
+
+def test_warnings_are_told_without_a_line_of_code(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown = warnings.formatwarning
+
+    def said(_: object) -> int:
+        print(warnings.formatwarning("raise --steps", UserWarning, "somewhere.py", 7), end="")
+        return 0
+
+    monkeypatch.setattr(cli.plot, "run", said)
+    assert cli.main(["plot", "results", "--out", "figure.png"]) == 0
+    assert capsys.readouterr().out == "sb3-rpto: warning: raise --steps\n"
+    assert warnings.formatwarning is shown

@@ -218,8 +218,8 @@ def _find(name: str, argument: str) -> World:
     if shifted and shifted[1] in tasks.TASKS:
         return World(name, tasks.env_id(shifted[1]), {"shift": shifted[2]})
     perhaps = _perhaps(env_id, [*gym.registry, *tasks.TASKS])
-    if not perhaps and not package:
-        perhaps = f"; one of your own is module:{name}, of the module that registers it"
+    if not package:
+        perhaps += f"{' One' if perhaps else '; one'} of your own is module:{name}, of the module that registers it"
     raise ValueError(f"{argument} {name!r} is no environment{perhaps}")
 
 

@@ -48,7 +48,10 @@ def load_model(source: ModelSource) -> tuple[mujoco.MjSpec | None, mujoco.MjMode
     if isinstance(source, str | os.PathLike):
         path = Path(source).expanduser()
         if not path.is_file():
-            raise FileNotFoundError(f"there is no MJCF file {str(path)!r}; MJCF text would begin with '<'")
+            raise FileNotFoundError(
+                f"there is no MJCF file {str(path)!r}; MJCF text would begin with '<', and of an environment "
+                "pass what gymnasium.make returns"
+            )
         return _compiled(mujoco.MjSpec.from_file, str(path), str(path))
     raise TypeError(
         f"a model is the path or text of an MJCF file, an MjSpec, an MjModel or a gymnasium MuJoCo environment, "

@@ -91,6 +91,8 @@ def read_columns(names: Iterable[str], file: str) -> Columns:
             unknown.append(name)
     if unknown:
         also = f" (unknown, too: {', '.join(map(repr, unknown[1:]))})" if unknown[1:] else ""
+        if unknown[0].startswith("#"):
+            raise ValueError(f"{file}: the first line is {unknown[0]!r}, a comment; remove the lines above the header")
         raise ValueError(
             f"{file}: unknown column {unknown[0]!r}; {_near(unknown[0])}; rename it, or drop what is not needed{also}"
         )

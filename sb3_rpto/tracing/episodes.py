@@ -121,6 +121,8 @@ def runs_of(file: str, table: Table) -> dict[str | None, dict[str, np.ndarray]]:
             row, odd = next((pair for pair in each if not _is_number(pair[1])), each[0])
             odd = odd.item() if isinstance(odd, np.generic) else odd
             remedy = "give seconds since the start of the run" if name == "time" else "correct or remove it"
+            if isinstance(odd, str) and _is_number(odd.replace(",", ".")):
+                remedy = "write decimals with a point"
             raise ValueError(
                 f"{file}: column {name!r} holds {odd!r}, which is no number, in row {row} (counted from 0 below the "
                 f"header); {remedy}"

@@ -12,6 +12,8 @@ from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.measurements import Measurements
 
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+#: A slide that moves over so many times what its limits let it is in other units, by whatever zero.
+OTHER_UNITS = 10
 #: A position this far, in rad or m, beyond a joint's limits is said to be: limits give way a little.
 BEYOND = 0.1
 
@@ -39,6 +41,8 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
             low, high = model.jnt_range[joint] if limited else (-np.inf, np.inf)
             if limited and model.jnt_type[joint] == _HINGE:
                 _check_radians(qpos[:, column], low, high, where)
+            elif limited:
+                _check_metres(qpos[:, column], low, high, where)
             middle = float(np.median(qpos[:, column]))
             if model.jnt_type[joint] == _HINGE and ((not low <= middle <= high) or where in wrapped):
                 centre = (low + high) / 2 if limited else float(model.qpos_spring[model.jnt_qposadr[joint]])
@@ -55,6 +59,25 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
                 found.append(Finding("outside limits", where, message))
         episodes.append(replace(episode, qpos=qpos))
     return replace(data, episodes=episodes), found
+
+
+def _check_metres(positions: np.ndarray, low: float, high: float, where: str) -> None:
+    """Refuse positions that move far further than a slide's limits let it, and are within them if they are in cm or mm.
+
+    :raises ValueError: such positions
+    """
+    if np.ptp(positions) <= OTHER_UNITS * (high - low):
+        return
+    units = [
+        unit
+        for unit, share in (("cm", 1e-2), ("mm", 1e-3))
+        if np.all((share * positions > low - BEYOND) & (share * positions < high + BEYOND))
+    ]
+    if units:
+        raise ValueError(
+            f"{where} spans {np.ptp(positions):.3g} where the model's limits are {low:.3g} and {high:.3g} m; give m, "
+            f"not {' or '.join(units)}"
+        )
 
 
 def _check_radians(angles: np.ndarray, low: float, high: float, where: str) -> None:

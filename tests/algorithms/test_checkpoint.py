@@ -375,6 +375,17 @@ def test_a_new_run_of_a_callbacks_checkpoint_keeps_its_last_step(tmp_path):
         np.testing.assert_array_equal(kept, had)
 
 
+def test_a_sac_that_sb3_loads_has_its_policy(tmp_path):
+    model = small(RPTO)  # the recipe of docs/checkpoints.md
+    sac = SAC("MlpPolicy", pendulum(), policy_kwargs=model.policy_kwargs, device="cpu")
+    parameters = model.get_parameters()
+    sac.set_parameters({name: value for name, value in parameters.items() if not name.startswith("dynamics")})
+    sac.save(tmp_path / "sac")
+    seen = pendulum().reset(seed=0)[0]
+    acts = [m.predict(seen, deterministic=True)[0] for m in (model, SAC.load(tmp_path / "sac", device="cpu"))]
+    np.testing.assert_array_equal(*acts)
+
+
 def test_files_and_arguments_that_load_cannot_take_are_named(tmp_path):
     model = small(RPO).learn(10, source_timesteps=60)
     model.save(tmp_path / "m.zip")

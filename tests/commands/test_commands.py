@@ -476,7 +476,11 @@ def test_an_environment_of_ones_own_is_found_beside_the_logs(tmp_path: Path, mon
         "import gymnasium as gym\n"
         "gym.register('mine/Arm-v7', 'gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv')\n"
     )
-    with pytest.raises(ValueError, match="'mine/Arm-v7' is no environment; one of your own is module:mine/Arm-v7"):
+    with pytest.raises(ValueError, match=r"did you mean .*\? One of your own is module:mine/Cart-v0"):
+        options.world("mine/Cart-v0", "SOURCE")
+    with pytest.raises(
+        ValueError, match=r"'mine/Arm-v7' is no environment(; did you .*\? O|; o)ne of your own is module:mine/Arm-v7"
+    ):
         options.world("mine/Arm-v7", "ENV")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))

@@ -178,6 +178,8 @@ def test_files_need_the_same_columns():
         ("time,qpos.hinge\n", "0 rows are too few"),
         ("episode,time,qpos.hinge\n", "no rows"),
         ("time;qpos.hinge\n0;1\n", "the columns are separated by ';'; separate them by commas"),
+        ("# robot log\ntime,qpos.hinge\n0,1\n", "the first line is '# robot log', a comment; remove"),
+        ('time,qpos.hinge\n0,"0,5"\n', "holds '0,5', which is no number, .*; write decimals with a point"),
         ("time,qpos.hinge,temperature\n0,1,2\n", "unknown column 'temperature'.* rename it, or drop"),
     ],
 )

@@ -58,6 +58,15 @@ def test_degrees_are_refused_where_the_joints_limits_tell_them() -> None:
     settle_turns(arm(""), recorded(np.degrees(ANGLE)))  # a wheel may well turn so far
 
 
+@pytest.mark.parametrize(("factor", "units"), [(1000, "mm"), (100, "cm or mm")])
+def test_a_slide_in_other_units_is_refused_where_its_limits_tell_them(factor: float, units: str) -> None:
+    with pytest.raises(ValueError, match=rf"qpos.hinge spans \d+.* limits are -1.5 and 1.5 m; give m, not {units}$"):
+        settle_turns(arm('type="slide" range="-1.5 1.5"'), recorded(factor * ANGLE))
+    settle_turns(arm('type="slide"'), recorded(factor * ANGLE))  # it may be long
+    _, found = settle_turns(arm('type="slide" range="-0.05 0.05"'), recorded(ANGLE))  # or the limits are wrong
+    assert [f.kind for f in found] == ["outside limits"]
+
+
 def test_a_joint_without_a_name_has_whole_turns_too() -> None:
     model = mujoco.MjModel.from_xml_string("""<mujoco><compiler angle="radian"/><worldbody><body>
         <joint axis="0 1 0" range="-1.5 1.5"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".03"/>
