@@ -263,13 +263,13 @@ class _Tell:
 def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> None:
     """Check and repair, in place, the channels of an episode that is not yet handed out."""
     tell = _Tell(episode, findings)
-    _look_at_samples(episode, tell)
+    _look_at_samples(episode, columns, tell)
     _repair_orientations(episode, columns, tell)
     _unwrap_angles(episode, columns, tell)
     _complete_velocities(episode, columns, tell)
 
 
-def _look_at_samples(episode: Episode, tell: _Tell) -> None:
+def _look_at_samples(episode: Episode, columns: Columns, tell: _Tell) -> None:
     spread = checks.jitter(episode.time)
     if spread > checks.JITTER:
         tell(
@@ -291,6 +291,16 @@ def _look_at_samples(episode: Episode, tell: _Tell) -> None:
             "like late sensors and commands",
             "qpos",
         )
+        return
+    for i, name in enumerate(columns.qpos):
+        rows = checks.held(episode.qpos[:, i : i + 1])
+        if rows is not None:
+            tell(
+                "held samples",
+                f"it is fresh in every {rows}. row alone, and repeated between: interpolate it between those rows, or "
+                "keep them alone, as what is held looks like a late sensor",
+                f"qpos.{name}",
+            )
 
 
 def _repair_orientations(episode: Episode, columns: Columns, tell: _Tell) -> None:

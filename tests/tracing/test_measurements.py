@@ -712,6 +712,10 @@ def test_held_samples_are_told_and_coarse_encoders_are_not() -> None:
         assert checks.held(position[:, None]) == found
     table = {"time": time, "qpos.hinge": held, "ctrl.motor": np.cos(time)}
     assert "held samples" in kinds(Measurements.from_tables({"a": table}))
+    mixed = Measurements.from_tables({"a": {**table, "qpos.elbow": motion}})  # one sensor is slower than the other
+    assert [(f.kind, f.where) for f in mixed.findings if f.kind == "held samples"] == [
+        ("held samples", "a, qpos.hinge")
+    ]
 
 
 def test_what_is_no_quaternion_is_refused() -> None:
