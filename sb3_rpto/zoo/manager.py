@@ -114,7 +114,8 @@ class TransferManager(ExperimentManager):
             hyperparams, saved = super().read_hyperparameters()
         finally:
             self.env_name = env_name
-        drawn = _applicable(self._drawn, hyperparams)
+        told = set(self.custom_hyperparams or ()) - {"dynamics_kwargs"}  # -params wins, as in the zoo; these are joined
+        drawn = _applicable({n: value for n, value in self._drawn.items() if n not in told}, hyperparams)
         for settings in (hyperparams, saved):
             settings.update(drawn)
         if self.resumes and self.start is not None:
