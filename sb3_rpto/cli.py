@@ -8,15 +8,13 @@ import importlib
 import os
 import sys
 import tempfile
-import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from sb3_rpto.commands import adapt, enjoy, plot, recordings, train, transfer
-from sb3_rpto.commands.options import check_file
-from sb3_rpto.commands.terminal import say
+from sb3_rpto.commands.terminal import lines, say
 from sb3_rpto.version import __version__
 
 #: Exit codes: bad input, and interrupted by the user.
@@ -116,12 +114,6 @@ def _add_trace(commands: Commands) -> None:
         type=Path,
         help="folder for the report and the model; those of an earlier trace are replaced",
     )
-    parser.add_argument(
-        "--known",
-        metavar="FILE",
-        type=Path,
-        help="effects that the machine is known to have: the effects.json of an earlier trace of the same MODEL",
-    )
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the split and the resampling (default: 0)")
     parser.add_argument(
         "--horizon",
@@ -150,8 +142,6 @@ def _add_trace(commands: Commands) -> None:
 
 
 def _trace(parsed: argparse.Namespace) -> int:
-    from sb3_rpto.effects.carry import read_effects
-    from sb3_rpto.effects.model import load_model
     from sb3_rpto.tracing import figures, trace
 
     # What would fail at the end fails now, before minutes of work.
@@ -163,13 +153,12 @@ def _trace(parsed: argparse.Namespace) -> int:
         raise ValueError(f"--calibrate is {parsed.calibrate}; give a number of data sets, or 0 for none")
     if parsed.threads < 0:
         raise ValueError(f"--threads is {parsed.threads}; give a number from 1, or 0 for one for each core")
-    check_file(parsed.known, "--known")
     if parsed.out.exists() and not parsed.out.is_dir():
         raise ValueError(f"--out {parsed.out} is a file; give a folder")
     model = _model(parsed.model)
     recordings.check_out(parsed.out, model)
+    known = recordings.known(parsed.known, model)
     data = recordings.read(parsed.files, parsed.format)
-    known = [] if parsed.known is None else read_effects(parsed.known, load_model(model)[1])
     with _folder(parsed.out), _progress(parsed.quiet) as progress:
         report = trace(
             model,
@@ -240,26 +229,15 @@ def _progress(quiet: bool) -> Iterator[Callable[[float, str], None] | None]:
         from rich.console import Console
         from rich.progress import Progress, TimeElapsedColumn
     except ImportError:
-        yield _lines()
+        yield lines()
         return
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield _lines()
+        yield lines()
         return
     with Progress(*Progress.get_default_columns()[:-1], TimeElapsedColumn(), console=console, transient=True) as bar:
         task = bar.add_task("reading", total=1.0)
         yield lambda share, what: bar.update(task, completed=share, description=what)
-
-
-def _lines() -> Callable[[float, str], None]:
-    last, began = [""], time.monotonic()
-
-    def say(share: float, what: str) -> None:
-        if what != last[0]:
-            print(f"[{share:4.0%}, {time.monotonic() - began:.0f} s] {what}", file=sys.stderr)
-        last[0] = what
-
-    return say
 
 
 # --- benchmark ------------------------------------------------------------------------------------------------------

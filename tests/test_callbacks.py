@@ -104,6 +104,7 @@ def test_a_bonus_in_the_target_is_its_discounted_sum():
     assert log["gap/dynamics"] == pytest.approx(0.3 * (1 - GAMMA**10) / (1 - GAMMA), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_other_dynamics_give_the_difference_of_the_returns():
     log = gaps(401, world(0.5), world(0.9, lengths=(200,)), **exact(0.5))
     difference = 1 / (1 - GAMMA * 0.9) - 1 / (1 - GAMMA * 0.5)

@@ -205,6 +205,7 @@ def test_the_report_is_written_where_the_model_cannot_be(
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["report.html", "report.json"]
 
 
+@pytest.mark.slow
 def test_what_a_terminal_cannot_show_keeps_nothing_from_being_written(
     files: Path, found: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -300,6 +300,7 @@ def test_what_a_search_draws_joins_the_settings():
     assert manager._applicable({"rollout_start": "mix"}, {"dynamics": "physical"}) == {}
 
 
+@pytest.mark.slow
 def test_an_environments_module_is_imported_where_it_runs(zoo, tmp_path, monkeypatch):
     (tmp_path / "faraway.py").write_text(
         "import gymnasium as gym\n"

@@ -24,6 +24,7 @@ from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.adequacy import SETTLED
 from sb3_rpto.tracing.contacts import OFTEN, contact_changes
+from sb3_rpto.tracing.prepare import Progress
 from sb3_rpto.tracing.report import Traced
 from sb3_rpto.tracing.zeros import Zeros
 
@@ -68,6 +69,8 @@ class LoopCloser:
         #: transitions of the target that were ever added before the last trace
         self._traced_at: int | None = None
         self._error = math.inf
+        #: called while it traces, as :func:`~sb3_rpto.tracing.trace.trace` calls it; no checkpoint holds it
+        self.progress: Progress | None = None
         #: whether the last transitions held too few windows to be traced
         self._untraced = False
         #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
@@ -86,7 +89,7 @@ class LoopCloser:
         self.rehearsals = Rehearsals()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "reports": []}
+        return {**vars(self), "reports": [], "progress": None}
 
     def forget_target(self) -> None:
         """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""
@@ -280,6 +283,7 @@ class LoopCloser:
             candidates=None if isinstance(self.kinds, bool) else self.kinds,
             horizon=horizon,
             threads=dynamics.threads,
+            progress=self.progress,
         )
         self.reports.append(report)
         self.found.append(report.to_json())

@@ -55,7 +55,8 @@ def run(parsed: argparse.Namespace) -> int:
     from sb3_rpto.algorithms.arguments import constructor_names
     from sb3_rpto.commands.progress import Progress, earnings, read_rows
     from sb3_rpto.commands.runs import RunFolder, beside, load_checkpoint
-    from sb3_rpto.commands.terminal import say
+    from sb3_rpto.commands.terminal import lines, say
+    from sb3_rpto.effects import Declared
     from sb3_rpto.files import write_atomically
     from sb3_rpto.tracing import figures
 
@@ -66,7 +67,18 @@ def run(parsed: argparse.Namespace) -> int:
     settings = dict(parsed.set)
     options.check_names(settings, constructor_names(RPTO) - GIVEN)
     world = options.world(parsed.env, "ENV")
-    recordings.check_out(parsed.out, world.make())
+    simulator = world.make()
+    recordings.check_out(parsed.out, simulator)
+    known = recordings.known(parsed.known, simulator)
+    declared = [*parsed.declare, *(e.label for e in known if isinstance(e, Declared) and e.label not in parsed.declare)]
+    effects = [e.to_json() for e in known if not isinstance(e, Declared)]
+    if effects:
+        own = settings.get("dynamics_kwargs", {})
+        if "effects" in own:
+            raise ValueError(
+                "--known and --set dynamics_kwargs both give effects; give them all in the file of --known"
+            )
+        settings["dynamics_kwargs"] = {**own, "effects": effects}
     data = recordings.read(parsed.files, parsed.format)
     config = {
         "command": "adapt",
@@ -75,9 +87,10 @@ def run(parsed: argparse.Namespace) -> int:
         "files": [beside(parsed.out, file) for file in parsed.files],
         "declare": parsed.declare,
         "candidates": parsed.candidates,
+        "known": None if parsed.known is None else beside(parsed.out, parsed.known),
         "steps": parsed.steps,
         "seed": parsed.seed,
-        "settings": settings,
+        "settings": dict(parsed.set),
     }
     folder = RunFolder.open(parsed.out, config)
     if folder.result.exists():
@@ -88,10 +101,10 @@ def run(parsed: argparse.Namespace) -> int:
     if checkpoint is None:
         model = RPTO.from_source(
             parsed.source_model,
-            world.make(),
+            simulator,
             target_data=data,
             dynamics="physical",
-            declared=parsed.declare,
+            declared=declared,
             close_loop=parsed.candidates or True,
             seed=parsed.seed,
             device=parsed.device,
@@ -99,8 +112,9 @@ def run(parsed: argparse.Namespace) -> int:
         )
         rows = []
     else:
-        model = load_checkpoint(checkpoint, world.make(), device=parsed.device)
+        model = load_checkpoint(checkpoint, simulator, device=parsed.device)
         rows = read_rows(checkpoint)
+    model.loop.progress = None if parsed.quiet else lines()
     progress = Progress(folder, parsed.steps, rows, parsed.quiet)
     model.learn(parsed.steps - model.num_timesteps, callback=progress, reset_num_timesteps=checkpoint is None)
     write_atomically(folder.model, model.save)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from sb3_rpto.effects import Effect
     from sb3_rpto.effects.model import ModelSource
     from sb3_rpto.tracing import Measurements
 
@@ -30,6 +31,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--candidates", metavar="K1,K2", type=names, help="kinds of effects to look for (default: all in the library)"
+    )
+    parser.add_argument(
+        "--known",
+        metavar="FILE",
+        type=Path,
+        help="effects that the machine is known to have: the effects.json of an earlier trace of the same simulator",
     )
 
 
@@ -63,6 +70,22 @@ def check_out(out: Path, model: ModelSource) -> None:
         raise ValueError(f"--out: {error}") from None
     with tempfile.TemporaryDirectory() as trial:
         save_corrected(trial, model, [])
+
+
+def known(path: Path | None, model: ModelSource) -> list[Effect]:
+    """The effects that a machine is known to have, declared numbers among them.
+
+    :param path: the effects.json of an earlier trace, if any
+    :param model: the nominal one
+    :raises FileNotFoundError: there is no such file
+    :raises ValueError: it holds something else, or an effect that the model cannot have
+    """
+    from sb3_rpto.commands.options import check_file
+    from sb3_rpto.effects.carry import read_effects
+    from sb3_rpto.effects.model import load_model
+
+    check_file(path, "--known")
+    return [] if path is None else read_effects(path, load_model(model)[1])
 
 
 def read(files: Sequence[str], form: str | None) -> Measurements:

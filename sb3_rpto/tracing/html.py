@@ -99,7 +99,8 @@ def _verdict(report: Report) -> str:
     means, caution = wording.VERDICTS[report.verdict]
     before, after = report.adequacy_before, report.adequacy_after
     idle = sum(c.status == "not excited" for c in report.candidates)
-    verdict = f"<b>{escape(report.verdict.capitalize())}.</b> {escape(means)}<br>{escape(caution)}"
+    said = "<br>".join(escape(sentence) for sentence in (means, *wording.rest(after), caution))
+    verdict = f"<b>{escape(report.verdict.capitalize())}.</b> {said}"
     apart = "that were not fitted" if report.judged_apart else "that were fitted, as too few runs are set apart"
     ratios = [f"<b>{escape(str(a).removeprefix('R = '))}</b>" for a in (before, after)]
     lines = [

@@ -193,7 +193,8 @@ class Report:
 
     def __str__(self) -> str:
         means, _ = wording.VERDICTS[self.verdict]
-        lines = [f"verdict: {self.verdict}", f"  {means}", "", "model", f"  {self.equation()}"]
+        said = [f"  {sentence}" for sentence in (means, *wording.rest(self.adequacy_after))]
+        lines = [f"verdict: {self.verdict}", *said, "", "model", f"  {self.equation()}"]
         for what, is_number in (("declared parameters", True), ("known effects", False)):
             given = [t for t in self.declared if isinstance(t.effect, Declared) == is_number]
             if given:

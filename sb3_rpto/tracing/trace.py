@@ -46,6 +46,7 @@ from sb3_rpto.tracing.residuals import learnable_share, summary
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.search import Found, find, worth_a_look
 from sb3_rpto.tracing.select import Selection, Selector
+from sb3_rpto.tracing.undeclared import undeclared_mass
 
 _NEVER = "beside what is kept it lowers the error of unseen windows by nothing clear"
 #: Another effect's typical error that is still as good, as a multiple.
@@ -229,6 +230,7 @@ def _of_the_verdict(
     return [
         *doubts(set_up.nominal, fitted),
         *misread(found, set_up),
+        *undeclared_mass(found, set_up),
         *(no_nearer(before, after) if named else []),
         *finer_steps(problem, values, found.on.fine.free(named), fitted, horizon),
         *(soft_instead(problem, values, named) if not fitted.simulated else []),

@@ -11,6 +11,7 @@ import numpy as np
 from sb3_rpto.effects import Effect, Parameter
 from sb3_rpto.effects.names import SCALAR_JOINTS, object_id, object_names
 from sb3_rpto.effects.units import joint_of
+from sb3_rpto.tracing.adequacy import TOLERANCE, Adequacy
 from sb3_rpto.tracing.measurements import Measurements
 
 #: For each verdict what it means, and what it does not mean.
@@ -34,6 +35,20 @@ VERDICTS = {
         "Effects that are listed all the same lower the error and are not claimed as the explanation.",
     ),
 }
+
+#: Below it the ratio of errors to those of noise tells of something small.
+SMALL = 1.5
+
+
+def rest(after: Adequacy) -> list[str]:
+    """In a sentence how small what remains is; none where nothing does, or where it is not small."""
+    if after.adequate or after.ratio >= SMALL:
+        return []
+    if after.ratio <= 1 + TOLERANCE:
+        few = percent(after.strays)
+        return [f"The typical window errs by no more than noise: what remains is in {few} of windows."]
+    share = percent(after.ratio - 1)
+    return [f"What remains is small: the typical window errs by {share} more than noise alone makes it."]
 
 
 def means(data: Measurements) -> str:

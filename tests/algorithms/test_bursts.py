@@ -70,7 +70,7 @@ def reads(monkeypatch):
     [
         (RPO, {}, 4),
         (RPO, {"ent_coef": 0.2}, 3),
-        (RPO, {"policy_kwargs": {"optimizer_class": th.optim.RMSprop}}, 4),
+        pytest.param(RPO, {"policy_kwargs": {"optimizer_class": th.optim.RMSprop}}, 4, marks=pytest.mark.slow),
         (RPTO, {"real_ratio": 0.5, "dynamics_kwargs": {"hidden": (8,), "termination_fn": None}}, 4),
     ],
     ids=["learned-temperature", "fixed-temperature", "another-optimizer", "batches-of-both-worlds"],

@@ -116,7 +116,7 @@ CASES = {
 
 
 #: Others go through the same code.
-SLOW_CASES = ("rto-pendulum", "rpo-mujoco", "rpto-residual")
+SLOW_CASES = ("rto-pendulum", "rpo-mujoco", "rpto-residual", "rpto-gsde", "physical-normalised", "rpo-normalised")
 
 
 @pytest.mark.parametrize(
@@ -301,6 +301,7 @@ def test_a_seed_that_is_given_after_loading_counts(how, tmp_path):
             assert_same(one, different)
 
 
+@pytest.mark.slow
 def test_branches_of_a_checkpoint_see_other_resets(tmp_path):
     small(RPO, source_steps=2).learn(20, source_timesteps=60).save(tmp_path / "m")
 
@@ -431,6 +432,7 @@ def test_a_baselines_numbers_are_checked_when_it_is_loaded(cls, given, message, 
         cls.load(tmp_path / "m", **given)
 
 
+@pytest.mark.slow
 def test_a_source_phase_goes_on_with_its_statistics(tmp_path, monkeypatch):
     def source():
         return VecNormalize(make_vec_env(pendulum, seed=3))
@@ -466,6 +468,7 @@ def test_statistics_come_back_where_the_state_of_their_world_is_unknown(tmp_path
     assert resumed.env.ret_rms.count > model.env.ret_rms.count
 
 
+@pytest.mark.slow
 def test_a_source_phase_over_an_unknown_world_goes_on_with_its_statistics(tmp_path, monkeypatch):
     model = small(RPO, normalised_unknown())
     model.set_logger(configure(str(tmp_path), []))
@@ -589,6 +592,7 @@ def test_another_target_knows_nothing_of_where_the_last_one_stood(tmp_path):
         np.testing.assert_allclose(after, side.next_observations[i, 0], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_world_that_cannot_restore_its_state_says_so(tmp_path):
     target = SubprocVecEnv([lambda: pendulum(12.0)])
     try:
@@ -602,6 +606,7 @@ def test_a_world_that_cannot_restore_its_state_says_so(tmp_path):
         target.close()
 
 
+@pytest.mark.slow
 def test_a_source_of_branches_has_no_episode_to_restore(tmp_path):
     source = SubprocVecEnv([pendulum])
     try:
@@ -851,6 +856,7 @@ def test_a_mujoco_simulator_is_saved_as_text_and_comes_back_to_the_last_bit(tmp_
         np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_another_target_begins_without_the_data_and_the_best_policy_of_the_last():
     model = small(RPO, stats_window_size=2)
     model.learn(500, source_timesteps=0)

@@ -205,6 +205,7 @@ def test_what_noisy_sensors_show_is_explained_all_the_same() -> None:
     assert dynamics(made).names == ["pole.length", "coulomb_friction(slider).level"]
 
 
+@pytest.mark.slow
 def test_phi_stays_what_a_trace_found_where_sensors_are_noisy() -> None:
     made = learned_from_noise()
     assert made.loop is not None
@@ -510,6 +511,7 @@ def test_what_was_not_explained_is_looked_for_again_in_twice_as_many_transitions
     assert loop.due(made, dynamics(made)) == due
 
 
+@pytest.mark.slow
 def test_a_new_target_is_traced_anew(soon: None) -> None:
     made = filled(friction())
     assert made.loop is not None
@@ -1369,6 +1371,7 @@ def test_a_target_after_its_log_begins_anew(soon: None) -> None:
     assert dynamics(made).describe()["coulomb_friction(slider).level"] == pytest.approx(LEVEL, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_a_log_goes_on_in_a_target_without_a_word_of_its_state(soon: None, tmp_path: Path) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     model([], target_data=measured).learn(40, source_timesteps=0).save(tmp_path / "model")

@@ -141,6 +141,7 @@ def test_the_signature_is_sacs_then_ours():
         assert all(ours[name].kind is inspect.Parameter.KEYWORD_ONLY for name in list(ours)[len(sac) :])
 
 
+@pytest.mark.slow
 def test_logged_keys_are_those_of_the_docs():
     model = small(RPTO, model_train_freq=100)
     model.set_logger(configure(None, []))

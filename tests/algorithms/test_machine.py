@@ -112,6 +112,7 @@ def test_a_number_at_its_bound_is_doubted():
         made.learn(45, source_timesteps=0)
 
 
+@pytest.mark.slow
 def test_what_fits_is_not_doubted():
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="after the fit")
@@ -132,7 +133,11 @@ class Fragile(gym.Wrapper):
     [
         (Fragile, r"termination_fn is not that of \d+ of 30 target transitions; pass .*'termination_fn'"),
         (lambda env: TransformReward(env, lambda r: r + 30), r"reward_fn is not that of 30 of 30 .*'reward_fn'"),
-        (lambda env: TransformReward(env, lambda r: 1.5 * r), r"reward_fn is not that of \d+ of 30"),
+        pytest.param(
+            lambda env: TransformReward(env, lambda r: 1.5 * r),
+            r"reward_fn is not that of \d+ of 30",
+            marks=pytest.mark.slow,
+        ),
         (lambda env: env, None),
     ],
 )

@@ -22,6 +22,7 @@ def assert_same_worlds(ours, theirs):
         assert th.equal(value, theirs.dynamics.networks.state_dict()[name]), name
 
 
+@pytest.mark.slow
 def test_model_and_data_are_rtos_without_weights():
     """The same seed and a policy that stays: the same numbers in D_source, in D_target and in the model."""
     ours = small(MBPO, gradient_steps=0).learn(120, source_timesteps=0)
@@ -73,6 +74,7 @@ def test_arguments_without_a_meaning_are_refused(argument):
         MBPO("MlpPolicy", pendulum(), **argument)
 
 
+@pytest.mark.slow
 def test_it_resumes_where_a_checkpoint_left_it(tmp_path):
     whole = small(MBPO).learn(60, source_timesteps=0)
     half = small(MBPO).learn(30, source_timesteps=0)

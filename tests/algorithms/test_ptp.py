@@ -89,6 +89,7 @@ def test_the_error_is_that_of_the_state_squared_and_of_the_reward_weighted():
     th.testing.assert_close(squared_error(predicted, data, 0.5), th.tensor([9.0 + 16 + 0.5 * 4, 0.5]))
 
 
+@pytest.mark.slow
 def test_the_error_network_learns_where_the_model_errs():
     generator = th.Generator().manual_seed(0)
     observations, following = th.randn(2, 2000, 3, generator=generator)

@@ -72,6 +72,17 @@ def test_a_log_becomes_a_report_a_simulator_and_a_policy(given: Path, tmp_path: 
 
 
 @pytest.mark.slow
+def test_what_is_known_is_fitted_and_not_found_again(given: Path, tmp_path: Path) -> None:
+    (tmp_path / "known.json").write_text(json.dumps([LIBRARY["torque_offset"]("hinge", offset=0.3).to_json()]))
+    assert adapt(given, tmp_path / "out", "--known", str(tmp_path / "known.json"), "--declare", "pole.mass") == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert (report["verdict"], report["effects"]) == ("complete", [])
+    known = {entry["label"]: entry["parameters"] for entry in report["declared"]}
+    assert known["torque_offset(hinge)"]["offset"]["value"] == pytest.approx(0.5, rel=0.02)
+    assert known.keys() == {"pole.mass", "torque_offset(hinge)"}
+
+
+@pytest.mark.slow
 def test_a_killed_run_goes_on_as_if_it_had_not_been(given: Path, tmp_path: Path, monkeypatch) -> None:
     assert adapt(given, tmp_path / "whole") == 0
     add = Progress._add_row
@@ -104,6 +115,7 @@ def test_a_killed_run_goes_on_as_if_it_had_not_been(given: Path, tmp_path: Path,
         ({}, ["--declare", "hinge.dampng"], "declared: 'hinge.dampng'"),
         ({}, ["--set", "target_env=x"], "--set target_env: there is no such argument"),
         ({}, ["--steps", "0"], "--steps is 0"),
+        ({}, ["--known", "absent.json"], "--known: there is no file"),
     ],
 )
 def test_bad_input_is_told_before_the_trace(given: Path, tmp_path: Path, capsys, passed, options, said) -> None:

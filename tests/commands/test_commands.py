@@ -250,6 +250,7 @@ def test_a_film_shows_three_panels(suffix: str, agent: Path, tmp_path: Path) -> 
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
 
 
+@pytest.mark.slow
 def test_a_film_of_mujoco_without_a_display(tmp_path: Path) -> None:
     pytest.importorskip("imageio", reason="the extra 'video' is not installed")
     try:  # MuJoCo alone: what fails of ours must not be skipped

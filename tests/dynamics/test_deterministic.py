@@ -93,6 +93,7 @@ def one_trajectory(n: int = 400) -> Transitions:
     return Transitions(s[:-1].clone(), actions, s[1:, 0], s[1:], th.zeros(n))
 
 
+@pytest.mark.slow
 def test_it_learns_a_linear_system_and_its_reward():
     model, data = make(), one_trajectory()
     log = model.fit(data, max_steps=600)

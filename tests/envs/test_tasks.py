@@ -222,6 +222,7 @@ def test_rules_are_those_of_the_very_world(task, shift):
         np.testing.assert_allclose(rules.reward_fn(*arguments).numpy(), rewards, atol=2e-2)
 
 
+@pytest.mark.slow
 def test_healthy_heights_of_a_target_in_another_process():
     remote = make_vec_env("sb3_rpto:rpto/Hopper-target1-v0", n_envs=1, vec_env_cls=SubprocVecEnv)
     try:

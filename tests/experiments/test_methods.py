@@ -131,6 +131,7 @@ def test_a_method_learns_on_the_device_that_it_is_given(
     assert set(asked) == {"cuda"} | ({"cpu"} if method in source_transitions else set())
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_updates_and_source_steps_are_counted(source_model: str) -> None:
     last = {method: run(method, source_model)[-1] for method in ("sac-warm", "sac-warm-high", "trpo-warm", "slbo")}
@@ -281,6 +282,7 @@ def test_the_row_of_a_method_that_learns_in_batches_is_of_what_it_has_learned(so
     assert not np.allclose(middle, end)
 
 
+@pytest.mark.slow
 def test_runs_repeat(source_model: str) -> None:
     first, again = (run("mbpo", source_model) for _ in range(2))
     assert [row["return"] for row in first] == [row["return"] for row in again]

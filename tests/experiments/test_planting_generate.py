@@ -142,6 +142,7 @@ def test_mujoco_replays_the_complete_model(name):
         np.testing.assert_allclose(data.qpos, episode.qpos[-1], atol=2e-5)
 
 
+@pytest.mark.slow
 def test_halving_the_step_changes_little_with_friction_in_every_joint():
     system = SYSTEMS["arm3"]
     ends = []

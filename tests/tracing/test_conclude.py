@@ -32,6 +32,7 @@ def test_dry_friction_is_found_as_the_robot_has_it(kind: str, noise: float) -> N
     assert [f.kind for f in report.findings].count("soft friction") == (kind == "soft_friction")
 
 
+@pytest.mark.slow
 def test_friction_that_gives_way_is_not_looked_for_where_no_dry_one_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(conclude, "creeping", lambda *_: pytest.fail("nobody asked for dry friction"))
     data = recorded([LIBRARY["soft_friction"]("hinge", level=0.3)], compiled(OWN), noise=0.0, exact=True)
@@ -52,6 +53,7 @@ class Smooth(gym.Wrapper):
         return self.env.step(self.mean)
 
 
+@pytest.mark.slow
 def test_a_filter_of_the_actions_is_found_as_it_was_written() -> None:
     source, target = gym.make("InvertedDoublePendulum-v5"), Smooth(gym.make("InvertedDoublePendulum-v5"))
     agent = SAC("MlpPolicy", Monitor(target), buffer_size=150, learning_starts=150, seed=0, device="cpu").learn(150)
@@ -64,6 +66,7 @@ def test_a_filter_of_the_actions_is_found_as_it_was_written() -> None:
     assert report.effects[0].effect.values == pytest.approx([0.4], abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lacks", ["a queue", "a late command", "nothing"])
 def test_what_came_before_a_run_is_told_by_its_first_steps(lacks: str) -> None:
     source, name = gym.make("InvertedDoublePendulum-v5"), "slide"
@@ -129,6 +132,7 @@ def test_a_simulator_that_has_less_is_explained_where_nothing_is_declared(plante
         assert traced.effect.values == pytest.approx(effect.values, abs=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("less", [True, False])
 def test_a_log_tells_that_the_model_has_too_much(less: bool) -> None:
     lacks = [LIBRARY["viscous_friction"]("hinge", coefficient=-0.035)] if less else []

@@ -70,6 +70,7 @@ CHAIN = f"""<mujoco><option timestep="0.005" integrator="RK4"><flag contact="dis
 <actuator><motor name="motor" joint="one"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kept", [(0, 1, 5), (3, 4, 5)])
 def test_joints_are_built_alike(kept: tuple[int, ...]) -> None:
     """Dry friction at three joints: one odd kind is made like the others, three wrong ones are made right at once."""

@@ -92,6 +92,7 @@ def test_a_filters_time_constant_is_declared_and_found() -> None:
     assert report.declared[0].effect.values[0] == pytest.approx(0.09, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_machine_without_actuators_is_complete() -> None:
     report = briefly(machine(""), steps(machine("")), ["hinge.damping"], candidates=["coulomb_friction"])
     assert report.verdict == "complete"

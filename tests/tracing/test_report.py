@@ -14,6 +14,7 @@ from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.effects.units import units_at
 from sb3_rpto.tracing import Report, trace, wording
+from sb3_rpto.tracing.adequacy import Adequacy
 from sb3_rpto.tracing.report import Traced
 
 SLIDE = """<mujoco><worldbody><body name="cart">
@@ -65,6 +66,20 @@ def test_text_says_where_an_effect_without_a_number_in_mjcf_is_carried(report: R
 def test_effects_are_not_claimed_unless_they_explain_the_data(report: Report) -> None:
     assert "it lacks" not in str(replace(report, verdict="partly explained"))
     assert "not explained" in str(replace(report, verdict="unexplained"))
+
+
+@pytest.mark.parametrize(
+    ("after", "said"),
+    [
+        (Adequacy(1.27, 1.2, 1.3, 0.0, 1.0), "by 27 % more than noise alone"),
+        (Adequacy(1.01, 0.9, 1.1, 0.15, 1e-6), "what remains is in 15 % of windows"),
+        (Adequacy(2.7, 2.2, 3.3, 0.4, 1e-9), None),
+        (Adequacy(1.01, 0.9, 1.1, 0.0, 1.0), None),
+    ],
+)
+def test_how_little_remains_is_said(report: Report, after: Adequacy, said: str | None) -> None:
+    text = str(replace(report, adequacy_after=after))
+    assert said in text if said else "remains" not in text
 
 
 def test_json_holds_the_numbers_of_the_report(report: Report) -> None:

@@ -70,6 +70,7 @@ def test_what_would_do_as_well_is_given_with_its_values_and_what_goes_with_them(
     assert f"{other.effect.label} instead: " in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_numbers_that_read_the_same_are_not_said_to_change() -> None:
     """Intervals of exact data are as narrow as rounding: other values lie outside, and are the same to people."""
     source = gym.make("InvertedPendulum-v5")

@@ -188,6 +188,7 @@ def test_verdicts() -> None:
     assert judge(poor, half, named=True) == judge(poor, poor, named=False) == "unexplained"
 
 
+@pytest.mark.slow
 def test_what_lies_outside_the_library_is_not_explained() -> None:
     report = traced(planted(("wind_gusts", "large")))
     assert report.verdict in ("unexplained", "partly explained")
@@ -236,12 +237,14 @@ def test_longer_windows_begin_where_the_others_do() -> None:
 # --- what a report depends on -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_report_to_the_last_bit_also_for_a_specification_of_the_model() -> None:
     assert simple_report().effects
     again = traced_simply(model=mujoco.MjSpec.from_string(COARSE))
     assert json.dumps(again.to_json()) == json.dumps(simple_report().to_json())
 
 
+@pytest.mark.slow
 def test_nothing_but_the_errors_depends_on_the_numbers_of_the_test_runs() -> None:
     report, data = simple_report(), simple()
     rng = np.random.default_rng(0)
@@ -262,6 +265,7 @@ def test_nothing_but_the_errors_depends_on_the_numbers_of_the_test_runs() -> Non
     assert mine["after"] != other["after"]
 
 
+@pytest.mark.slow
 def test_a_split_column_is_honoured() -> None:
     names = [e.run for e in simple().episodes]
     report = traced_simply(parted(simple(), ["test", "train", "select", "train", "select"]))
@@ -330,6 +334,7 @@ def test_nothing_declared_and_no_candidates_is_a_check_of_the_model() -> None:
     assert traced_simply(few(4), [], declared=()).verdict == "unexplained"
 
 
+@pytest.mark.slow
 def test_a_declared_parameter_that_the_data_cannot_show_stops_nothing() -> None:
     still = np.zeros((5, 210))
     data = recorded([TorqueOffset("hinge", offset=0.2)], compiled(COARSE), 5, commands=still, rate=100)
@@ -545,6 +550,7 @@ def with_known(data: Measurements, *known: Effect, declared: Sequence[str] = ("p
         return trace(COARSE, data, declared, known=known, candidates=NATIVE, horizon=0.4, threads=1)
 
 
+@pytest.mark.slow
 def test_a_known_effect_is_fitted_and_what_else_is_missing_is_named(tmp_path: Path) -> None:
     report = with_known(late(0.08), CommandDelay("motor", delay=0.03))
     assert report.verdict == "explained"
@@ -571,6 +577,7 @@ def test_a_known_effect_that_is_not_there_ends_at_its_null() -> None:
     assert report.declared[1].effect.values[0] == pytest.approx(0.0, abs=5e-4)
 
 
+@pytest.mark.slow
 def test_a_correction_is_gone_on_from() -> None:
     first = with_known(late(), CommandDelay("motor", delay=0.03))
     then = with_known(late(0.08), *first.correction, declared=())
@@ -609,6 +616,7 @@ def test_the_shape_of_a_known_effect_does_not_bend_to_what_is_missing() -> None:
     assert np.isnan(known.interval[:, shape]).all()
 
 
+@pytest.mark.slow
 def test_what_the_data_do_not_show_stays_as_it_is_given_and_is_named() -> None:
     saturation = LIBRARY["command_saturation"]("motor", inverse_limit=0.3)  # far above all commands
     report = with_known(simple(), saturation)

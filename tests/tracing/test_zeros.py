@@ -97,6 +97,7 @@ def test_recordings_lose_the_zeros_of_their_runs_alone() -> None:
         np.testing.assert_allclose(after.qpos - before.qpos, off, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_corrected_model_tells_the_zeros_of_other_runs() -> None:
     report = traced(0.0, 1.0)
     new = shifted(recorded([], compiled(), 2, 4.0, seed=9), [0.07, -0.05])
