@@ -19,8 +19,8 @@ from sb3_rpto.algorithms.rounds import Rounds, learn_for_a_step
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Declared, from_json
+from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import single_env
-from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.adequacy import SETTLED
 from sb3_rpto.tracing.contacts import OFTEN, contact_changes

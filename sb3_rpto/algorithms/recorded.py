@@ -16,10 +16,10 @@ from sb3_rpto.dynamics.simulator import check_commands
 from sb3_rpto.effects import Effect, Simulation
 from sb3_rpto.effects.simulation import names_of
 from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.envs.observations import env_name, layers, leaves_observations
 from sb3_rpto.envs.rules import Rule, task_rules
-from sb3_rpto.envs.state import copy_env
 from sb3_rpto.tracing import Episode, Measurements
 from sb3_rpto.tracing.model_checks import check_clock, check_names
 from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, half_step, start_state, straight

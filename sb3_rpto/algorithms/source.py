@@ -23,7 +23,8 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
 from sb3_rpto.effects.stance import StandingEnv
-from sb3_rpto.envs.state import copy_env, reseed, restore_state, save_state, whereabouts
+from sb3_rpto.envs.copies import copy_env
+from sb3_rpto.envs.state import reseed, restore_state, save_state, whereabouts
 
 RolloutStart = Literal["target", "source", "mix"]
 

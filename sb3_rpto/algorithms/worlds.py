@@ -13,8 +13,9 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 
+from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import layers
-from sb3_rpto.envs.state import accepts_seed, copy_env, restore_state, save_state, whereabouts
+from sb3_rpto.envs.state import accepts_seed, restore_state, save_state, whereabouts
 
 
 class TargetLedger(VecEnvWrapper):

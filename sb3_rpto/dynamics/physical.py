@@ -23,8 +23,8 @@ from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import StateMap, noise_of_each, single_env
-from sb3_rpto.envs.state import copy_env
 
 #: Fits use the newest transitions: a few numbers are known long before.
 MAX_TRANSITIONS = 500

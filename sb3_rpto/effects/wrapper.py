@@ -261,7 +261,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         if not isinstance(self.unwrapped, EzPickle):
             raise TypeError(
                 f"{type(self.unwrapped).__name__} is no EzPickle, so its pickle would hide what was written to its "
-                "model; copy it by sb3_rpto.envs.state.copy_env"
+                "model; copy it by sb3_rpto.envs.copies.copy_env"
             )
         return {"env": self.env, "effects": self.effects}
 

@@ -1,4 +1,4 @@
-"""Snapshots and trial copies of environments, so that a resumed run continues bit for bit.
+"""Snapshots of environments, so that a resumed run continues bit for bit.
 
 A snapshot is complete or there is none: every layer must be of a class whose state is known here.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import wrappers
 from gymnasium.envs.classic_control import Continuous_MountainCarEnv, PendulumEnv
 from gymnasium.utils.seeding import np_random
-from stable_baselines3.common.monitor import Monitor, ResultsWriter
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
@@ -276,62 +276,6 @@ def _whereabouts(env: gym.Env) -> tuple[Any, ...]:
     elif _is_mujoco_task(base):
         known += [base.data.time, base.data.qpos.tobytes()]  # type: ignore[attr-defined]
     return tuple(known)
-
-
-# --- trial copies -----------------------------------------------------------------------------------------------
-
-
-def copy_env(env: VecEnv | gym.Env) -> gym.Env | None:
-    """Copy an environment (of a VecEnv the first) with all its wrappers, to try things without touching the original.
-
-    The copy draws no pictures and writes no files. (Python's own deep copy of a gymnasium MuJoCo task makes a new
-    one from the constructor's arguments, which loses every later change of the model.)
-
-    :param env: the environment, untouched
-    :return: the copy, or None when it cannot be made (subprocesses, contents that do not copy)
-    """
-    base = env if isinstance(env, gym.Env) else env.unwrapped
-    if not isinstance(base, gym.Env | DummyVecEnv):
-        return None
-    try:
-        return _clone(base if isinstance(base, gym.Env) else base.envs[0], {})
-    except Exception:  # whatever the contents of a user's environment raise when copied
-        return None
-
-
-def _clone(env: gym.Env, memo: dict[int, Any]) -> gym.Env:
-    if isinstance(env, wrappers.RecordVideo | wrappers.HumanRendering | wrappers.RenderCollection):
-        return _clone(env.env, memo)
-    twin = object.__new__(type(env))
-    memo[id(env)] = twin
-    for name, value in vars(env).items():
-        if isinstance(value, gym.Env):
-            copied = memo[id(value)] if id(value) in memo else _clone(value, memo)
-        elif _is_handle(value):
-            copied = None
-        elif type(value).__name__ == "MjData":
-            copied = _clone_data(value, copy.deepcopy(vars(env)["model"], memo))
-        else:
-            copied = copy.deepcopy(value, memo)
-        vars(twin)[name] = copied
-    if not isinstance(twin, gym.Wrapper):
-        twin.render_mode = None
-    return twin
-
-
-def _is_handle(value: Any) -> bool:
-    """Windows and files belong to the original."""
-    module = type(value).__module__
-    return isinstance(value, ResultsWriter) or module.startswith(("pygame", "gymnasium.envs.mujoco.mujoco_rendering"))
-
-
-def _clone_data(data: Any, model: Any) -> Any:
-    """A copy of MjData that steps the copied model."""
-    import mujoco
-
-    twin = mujoco.MjData(model)
-    mujoco.mj_copyData(twin, model, data)
-    return twin
 
 
 def accepts_seed(env: gym.Env) -> bool:

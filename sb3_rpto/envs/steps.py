@@ -10,8 +10,8 @@ import numpy as np
 
 from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.engine import quiet
+from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import StateMap
-from sb3_rpto.envs.state import copy_env
 
 #: Episodes whose first step is compared with MuJoCo alone.
 TRIED = 3

@@ -10,8 +10,9 @@ from sb3_rpto.effects import Declared, Effect, Parameter
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
 from sb3_rpto.effects.model import numbers
 from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.envs.state import copy_env, restore_state, save_state
+from sb3_rpto.envs.state import restore_state, save_state
 
 POLE = "InvertedDoublePendulum-v5"
 

@@ -13,7 +13,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecCheckNan, VecMonitor, VecNormalize
 
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
-from sb3_rpto.envs.state import accepts_seed, copy_env, restore_state, save_state
+from sb3_rpto.envs.copies import copy_env
+from sb3_rpto.envs.state import accepts_seed, restore_state, save_state
 
 MUJOCO = [
     *("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "InvertedDoublePendulum-v5", "InvertedPendulum-v5", "Pusher-v5"),
