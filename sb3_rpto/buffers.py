@@ -72,6 +72,8 @@ class DualReplayBuffer(ReplayBuffer):
         self.target = self._make_side(buffer_size=target_size, device=device)
         #: transitions of this target that were ever added, those that its side forgot included
         self.target_added = 0
+        #: whether the target side is a robot's log that was traced, whose states are estimates
+        self.estimated = False
         #: observations of the real source environment, from which model branches may start; (n, observation_dim)
         self.source_starts = np.empty((0, *observation_space.shape), dtype=observation_space.dtype)
         # BaseBuffer alone: ReplayBuffer's constructor would allocate a third set of arrays.
@@ -125,6 +127,7 @@ class DualReplayBuffer(ReplayBuffer):
         """Forget the target side: to SB3 it is the replay buffer."""
         self.target.reset()
         self.target_added = 0
+        self.estimated = False
 
     def add(
         self,

@@ -138,14 +138,7 @@ class TwoWorlds(PolicySnapshots):
             self._owed = 0
             if self.loop is not None:
                 self.loop.forget_target()
-            if self.replay_buffer.target.size() > 0:
-                remedy = "; to go on in the same one, save, and load with target_env="
-                warnings.warn(
-                    f"D_target loses {self.replay_buffer.target.size()} transitions of the "
-                    + ("log, whose states are estimates" if self._offline else f"target before{remedy}"),
-                    stacklevel=2,
-                )
-                self.replay_buffer.reset()
+            self._drop_target_data()
         if self.target_env is not None or self._offline:
             self._round_open, self._collected, self._rollout_began_at = False, 1, self.num_timesteps
             if self._resume_state is not None:
@@ -158,6 +151,18 @@ class TwoWorlds(PolicySnapshots):
         self._last_obs = None
         if self.seed is not None:
             self.target_env.seed(self.seed + TARGET_SEED_OFFSET)
+
+    def _drop_target_data(self) -> None:
+        """D_target without what another target told."""
+        buffer = self.replay_buffer
+        if buffer.target.size() > 0:
+            whose = (
+                "log, whose states are estimates"
+                if buffer.estimated
+                else "target before; to go on in the same one, save, and load with target_env="
+            )
+            warnings.warn(f"D_target loses {buffer.target.size()} transitions of the {whose}", stacklevel=3)
+        buffer.reset()
 
     def _check_pair(self, source: VecEnv, target: VecEnv) -> None:
         """Refuse a target that cannot be the source's, or not that of the simulator that is fitted to it."""

@@ -143,6 +143,7 @@ def fill_recorded(model: Resumable, measured: Measurements, effects: Sequence[Ef
     rules = {name: model.dynamics_kwargs.get(name) for name in ("reward_fn", "termination_fn")}
     arrays = recorded.transitions(measured, single_env(model.env), effects, **rules)
     model.replay_buffer.reset()
+    model.replay_buffer.estimated = model._traces_log
     if not len(arrays["actions"]):
         message = "target_data holds no whole step that begins where the task goes on"
         if not model._traces_log:

@@ -1382,6 +1382,31 @@ def test_a_checkpoint_of_a_log_goes_on_in_a_target_without_a_word_of_its_state(s
     assert made.target_spent == {"learning": 45}
 
 
+@pytest.mark.parametrize("first", ["the buffer", "the target"])
+def test_a_target_after_a_log_begins_without_the_logs_estimates(first: str, soon: None, tmp_path: Path) -> None:
+    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
+    made = model([], target_data=measured).learn(40, source_timesteps=0)
+    made.save(tmp_path / "model")
+    made.save_replay_buffer(tmp_path / "buffer")
+    later = target([])
+    loses = pytest.warns(UserWarning, match=r"D_target loses \d+ transitions of the log, whose states are estimates")
+    if first == "the buffer":
+        made = RPTO.load(tmp_path / "model", env=gym.make(TASK), device="cpu")
+        made.load_replay_buffer(tmp_path / "buffer")
+        with loses:
+            made.set_target_env(later)
+    else:
+        made = RPTO.load(tmp_path / "model", env=gym.make(TASK), target_env=later, device="cpu")
+        with loses:
+            made.load_replay_buffer(tmp_path / "buffer")
+    assert made.replay_buffer.target.size() == made.replay_buffer.target_added == 0
+    assert made.replay_buffer.source.size() > 0
+    made.save_replay_buffer(tmp_path / "later")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="D_target loses")
+        made.load_replay_buffer(tmp_path / "later")
+
+
 def test_a_rehearsal_that_was_interrupted_is_played_again(monkeypatch: pytest.MonkeyPatch) -> None:
     made = forgetful()
     assert made.loop is not None
