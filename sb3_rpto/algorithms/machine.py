@@ -16,6 +16,7 @@ from sb3_rpto.dynamics.base import Dynamics, Transitions
 from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
+from sb3_rpto.dynamics.simulator import check_source
 from sb3_rpto.effects.model import differing, sites_act
 from sb3_rpto.envs.observations import layers, mujoco_model, single_env, state_map
 from sb3_rpto.tracing.columns import columns_of
@@ -104,9 +105,11 @@ def check_simulator(source: VecEnv, dynamics: Dynamics | None) -> None:
 
     :param source: which was set, or with which a checkpoint was loaded
     :param dynamics: which were built from an earlier one
+    :raises ValueError: it does more than its model and phi do, as one that was corrected already
     """
     physical = dynamics.physical if isinstance(dynamics, ResidualDynamics) else dynamics
     if isinstance(physical, PhysicalDynamics):
+        check_source(source)
         model = mujoco_model(single_env(source))
         # Places that nothing acts at are marks, such as a goal's, which a task may move.
         found = [n for n in differing(physical.model, model) if not n.startswith("site_") or sites_act(model)]

@@ -27,29 +27,41 @@ def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
     """What :class:`~sb3_rpto.dynamics.physical.PhysicalDynamics` must know of an environment; plain data that pickles.
 
     :param env: with all its wrappers; of a VecEnv the first
+    :raises ValueError: as :func:`check_source`
+    """
+    recover = check_source(env)
+    single: Any = single_env(env)
+    spec, model = load_model(single)[0], mujoco_model(single)
+    plain = model.__copy__() if spec is None else PlainModel.of(spec, model)  # nothing tells the MJCF of some
+    return {"model": plain, "recover": recover, "frame_skip": int(single.unwrapped.frame_skip)}
+
+
+def check_source(env: gym.Env | VecEnv) -> StateMap:
+    """Require that an environment does what its model and phi do, and nothing else; the map to its states.
+
+    :param env: with all its wrappers; of a VecEnv the first
     :raises ValueError: no MuJoCo model, states that cannot be recovered from observations or are not what these are
         read as, actions that are not the commands of the actuators, steps that are more than their simulation, several
         models
     """
     single = single_env(env)
-    model, recover = mujoco_model(single), state_map(single)
+    mujoco_model(single)  # what is no MuJoCo task is told first
+    recover = state_map(single)
     check_commands(single, "dynamics='physical'")
     check_alike(env)
     hidden = beyond_model(single)
     if hidden:
         raise ValueError(
             f"{env_name(single)} has effects that are no numbers of its model ({', '.join(hidden)}), which phi would "
-            "lack; give the environment without them, and them as dynamics_kwargs={'effects': [...]} (a closed "
-            "loop takes them for known)"
+            "lack, or have twice; give the environment without them, and them as dynamics_kwargs={'effects': [...]} (a "
+            "closed loop takes them for known)"
         )
     frame_skip = getattr(single.unwrapped, "frame_skip", None)
     if frame_skip is None:
         raise ValueError(f"{env_name(single)} has no frame_skip; derive it from gymnasium.envs.mujoco.MujocoEnv")
     check_step(single, int(frame_skip))
     check_states(single, recover)
-    spec, _ = load_model(single)
-    plain = model.__copy__() if spec is None else PlainModel.of(spec, model)  # nothing tells the MJCF of some
-    return {"model": plain, "recover": recover, "frame_skip": int(frame_skip)}
+    return recover
 
 
 def check_commands(env: gym.Env, what: str) -> None:

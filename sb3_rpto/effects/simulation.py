@@ -75,6 +75,9 @@ class Simulation:
         self._worlds: dict[tuple[int, ...], BatchWorld] = {}
         self._kinds: dict[tuple[int, ...], BatchWorld] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_worlds": {}, "_kinds": {}}  # batches are made anew
+
     def values(self) -> np.ndarray:
         """The effects' own values, (p,)."""
         return np.concatenate([e.values for e in self.effects]) if self.effects else np.empty(0)

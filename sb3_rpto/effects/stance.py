@@ -81,9 +81,6 @@ class StandingEnv(CorrectedEnv):
         """As in :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`."""
         return {**super().__getstate__(), "before": self._stance.before}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        StandingEnv.__init__(self, **state)
-
 
 def nominal_heights(model: mujoco.MjModel) -> tuple[float, float] | None:
     """Of the reference pose, as :class:`Stance` keeps them: its lowest point over the floor, its body over that; m."""

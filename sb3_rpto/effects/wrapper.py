@@ -177,8 +177,8 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         """
         if getattr(self.unwrapped, "mujoco_renderer", self) is None:
             raise RuntimeError(
-                "a corrected copy draws no pictures; for those CorrectedEnv(gym.make(..., render_mode='rgb_array'), "
-                "effects)"
+                "a corrected copy draws no pictures; for those sb3_rpto.effects.stance.StandingEnv(gym.make(..., "
+                "render_mode='rgb_array'), effects)"
             )
         return self.env.render()
 
@@ -257,16 +257,36 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             data.qpos[:], data.qvel[:], data.sensordata[:] = qpos, qvel, readings
 
     def __getstate__(self) -> dict[str, Any]:
-        """As gymnasium's own pickling of MuJoCo tasks: what makes a new one, without the state of the simulation."""
+        """What makes a new one, as gymnasium pickles MuJoCo tasks, and the numbers of its model; no state of it."""
         if not isinstance(self.unwrapped, EzPickle):
             raise TypeError(
                 f"{type(self.unwrapped).__name__} is no EzPickle, so its pickle would hide what was written to its "
                 "model; copy it by sb3_rpto.envs.copies.copy_env"
             )
-        return {"env": self.env, "effects": self.effects}
+        if self._covered:  # the outermost keeps the numbers for all
+            return {"env": self.env, "effects": self.effects}
+        self._world.restore()
+        self._world.settle()
+        try:
+            model = copy.copy(self.unwrapped.model)  # type: ignore[attr-defined]
+        finally:
+            prepare(self._world, active(self.effects))
+        return {"env": self.env, "effects": self.effects, "model": model}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        CorrectedEnv.__init__(self, **state)
+        env = with_numbers(state.pop("env"), state.pop("model", None))
+        type(self).__init__(self, env, **state)
+
+
+def with_numbers(env: gym.Env, model: mujoco.MjModel | None) -> gym.Env:
+    """An environment that was made anew, with what had been written to its model since it was first made."""
+    from sb3_rpto.effects.model import numbers, set_number  # which imports this module
+
+    base: Any = env.unwrapped
+    for name, value in ({} if model is None else numbers(model)).items():
+        if not np.array_equal(value, numbers(base.model)[name], equal_nan=True):
+            set_number(base.model, name, list(range(value.size)), value.ravel().tolist())
+    return env
 
 
 def corrections(env: gym.Env) -> list[CorrectedEnv]:

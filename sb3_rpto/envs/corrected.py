@@ -14,7 +14,7 @@ def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:
     """A copy of ``env`` with effects, for RPTO, SAC or anything; ``env`` is left alone.
 
     :param env: a gymnasium MuJoCo environment, with all its wrappers; the copy draws no pictures and writes no files
-        (for those ``CorrectedEnv(gym.make(..., render_mode=...), effects)``)
+        (for those ``StandingEnv(gym.make(..., render_mode=...), effects)`` of :mod:`sb3_rpto.effects.stance`)
     :param effects: with their values; they come on top of those that ``env`` has already
     :raises TypeError: a VecEnv
     :raises ValueError: no gymnasium MuJoCo environment, or one that cannot be copied
@@ -27,6 +27,7 @@ def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:
     twin = copy_env(env)
     if twin is None:
         raise ValueError(
-            f"{env} holds what cannot be copied; make a new one and wrap it: CorrectedEnv(gym.make(...), effects)"
+            f"{env} holds what cannot be copied; make a new one and wrap it: "
+            "sb3_rpto.effects.stance.StandingEnv(gym.make(...), effects)"
         )
     return StandingEnv(twin, effects)

@@ -14,7 +14,7 @@ from gymnasium.utils import RecordConstructorArgs
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect, from_json
 from sb3_rpto.effects.stance import Stance, StandingEnv
-from sb3_rpto.effects.wrapper import CorrectedEnv
+from sb3_rpto.effects.wrapper import CorrectedEnv, with_numbers
 from sb3_rpto.envs.shifts import EnvShift, as_shift, number_names
 
 
@@ -57,5 +57,5 @@ class ShiftedEnv(StandingEnv):
         return {**super().__getstate__(), "shift": self.shift}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        ShiftedEnv.__init__(self, state["env"], state["shift"])
+        ShiftedEnv.__init__(self, with_numbers(state["env"], state.get("model")), state["shift"])
         self.set_effects(state["effects"])

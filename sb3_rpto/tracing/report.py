@@ -12,6 +12,7 @@ import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.carry import carried_by, check_free, save_corrected
+from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.files import json_text, plain, write_text
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import Adequacy
@@ -169,6 +170,17 @@ class Report:
     values_after: np.ndarray
     data: Measurements
     sigma: np.ndarray
+
+    def __getstate__(self) -> dict[str, Any]:
+        spec = self.source[0] if isinstance(self.source, tuple) else None
+        # A specification does not pickle; its text does, with the numbers that the model had.
+        return {**vars(self), "source": self.source if spec is None else PlainModel.of(*self.source)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        source = state["source"]
+        if isinstance(source, PlainModel):
+            source = mujoco.MjSpec.from_string(source.text, assets=source.assets), source.compile()
+        vars(self).update({**state, "source": source})
 
     @property
     def correction(self) -> list[Effect]:

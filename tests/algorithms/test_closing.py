@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.wrappers import TransformAction
 from queued import Queue
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
@@ -1380,6 +1381,21 @@ def test_a_checkpoint_of_a_log_goes_on_in_a_target_without_a_word_of_its_state(s
         warnings.filterwarnings("error", message=".*cannot be restored")
         made.learn(45, reset_num_timesteps=False)
     assert made.target_spent == {"learning": 45}
+
+
+def test_a_source_that_was_corrected_already_is_refused(soon: None, tmp_path: Path) -> None:
+    made = model([])
+    made.save(tmp_path / "model")
+    corrected = apply_effects(gym.make(TASK), [LIBRARY["torque_offset"]("slider", offset=8.0)])
+    said = r"torque_offset\(slider\).*or have twice"
+    with pytest.raises(ValueError, match=said):
+        RPTO.load(tmp_path / "model", env=corrected, device="cpu")
+    before = made.env
+    with pytest.raises(ValueError, match=said):
+        made.set_env(corrected)
+    with pytest.raises(ValueError, match="TransformAction changes actions"):
+        made.set_env(TransformAction(gym.make(TASK), lambda a: 2 * a, None))
+    assert made.env is before
 
 
 @pytest.mark.parametrize("first", ["the buffer", "the target"])

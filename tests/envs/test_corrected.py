@@ -1,17 +1,21 @@
 """Corrected copies: the source stays as it is, and branches of the copy replay exactly."""
 
+import copy
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_rpto.effects import Declared, Effect, Parameter
+from sb3_rpto.effects import LIBRARY, Declared, Effect, Parameter, declare
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
-from sb3_rpto.effects.model import numbers
+from sb3_rpto.effects.model import differing, numbers
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.envs.shifts import EnvShift
 from sb3_rpto.envs.state import restore_state, save_state
 
 POLE = "InvertedDoublePendulum-v5"
@@ -166,3 +170,23 @@ def test_bad_environments_are_named():
     stuck.unwrapped.lock = (n for n in ())  # generators cannot be copied
     with pytest.raises(ValueError, match="cannot be copied"):
         apply_effects(stuck, [])
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_what_was_written_to_the_model_is_pickled(again) -> None:
+    env = gym.make("Hopper-v5")
+    env.unwrapped.model.opt.timestep = 0.001
+    env.unwrapped.model.body_mass[2] *= 1.5
+    thigh = declare(env.unwrapped.model, ["thigh.mass"])[0].with_values(np.array([5.0]))
+    one = apply_effects(env, [thigh])
+    two = apply_effects(one, [LIBRARY["viscous_friction"]("foot_joint", coefficient=0.3)])
+    for made in (one, two, EnvShift("slippery", {"*.friction": 0.5}).apply(env)):
+        other = again(made)
+        assert differing(made.unwrapped.model, other.unwrapped.model) == []
+        assert other.unwrapped.dt == made.unwrapped.dt
+        (first, _), (second, _) = made.reset(seed=0), other.reset(seed=0)
+        np.testing.assert_array_equal(first, second)
+        for _ in range(5):
+            np.testing.assert_array_equal(made.step(np.full(3, 0.4))[0], other.step(np.full(3, 0.4))[0])
+    other.set_effects([])
+    assert other.unwrapped.model.body_mass[2] == env.unwrapped.model.body_mass[2]

@@ -1,6 +1,8 @@
 """The report: its text, its JSON, and the corrected model that it saves."""
 
+import copy
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -191,3 +193,12 @@ def test_equations_have_numbers_for_names() -> None:
     assert wording.with_numbers(TorqueOffset("hinge", offset=-0.5)) == "-0.5"
     # Its equation is in words, one of which is a parameter's name.
     assert wording.with_numbers(Payload("pole", mass=0.1)) == f"{Payload.equation} with mass 0.1 kg, along 2"
+
+
+def test_a_report_pickles(report: Report, tmp_path: Path) -> None:
+    for other in (pickle.loads(pickle.dumps(report)), copy.deepcopy(report)):
+        assert str(other) == str(report)
+        report.save(tmp_path / "one")
+        other.save(tmp_path / "other")
+        for file in (tmp_path / "one").iterdir():
+            assert (tmp_path / "other" / file.name).read_bytes() == file.read_bytes()
