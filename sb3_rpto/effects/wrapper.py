@@ -73,7 +73,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
     """
 
     #: what changes after it is made, for :func:`sb3_rpto.envs.state.save_state`
-    state_attributes: ClassVar[tuple[str, ...]] = ("_memory", "_past")
+    state_attributes: ClassVar[tuple[str, ...]] = ("_memory", "_past", "_time")
 
     def __init__(self, env: gym.Env, effects: Sequence[Effect]) -> None:
         RecordConstructorArgs.__init__(self, effects=effects)
@@ -87,6 +87,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         # States of the last substeps, the newest last: what late sensors show.
         self._past: list[tuple[np.ndarray, np.ndarray]] = []
         self._acting: list[tuple[Effect, np.ndarray]] = []
+        self._time = 0.0  # of the simulation when it was last seen
         beneath = corrections(env)
         self._covered = False
         # What the environment was seen to use, and must: one for all, since the outermost simulates for the others.
@@ -161,10 +162,23 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; commands from before it are forgotten."""
+        self._begin_anew()
+        begun = self.env.reset(seed=seed, options=options)
+        self._time = float(self.unwrapped.data.time)  # type: ignore[attr-defined]
+        return begun
+
+    def _begin_anew(self) -> None:
         step = float(self._world.model.opt.timestep)
         self._memory = [effect.memory_at_reset(x, step) for effect, x in self._commanding]
         self._past = []
-        return self.env.reset(seed=seed, options=options)
+
+    def _look_at_time(self) -> None:
+        """Begin anew where a wrapper beneath, such as ``Autoreset``, has reset the simulation by itself."""
+        time = float(self.unwrapped.data.time)  # type: ignore[attr-defined]
+        if time < self._time:
+            for layer in corrections(self):
+                layer._begin_anew()
+        self._time = time
 
     def forget_commands(self) -> None:
         """Go on as if the next command had been sent all along."""
@@ -201,6 +215,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         base: Any = self.unwrapped
         model, data = base.model, base.data
         self._called.add(self._seam)
+        self._look_at_time()
         stack = corrections(self)
         acting = pushing([pair for layer in reversed(stack) for pair in layer._acting])
         commanding = [
@@ -232,10 +247,12 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             world.restore()
             data.qfrc_applied[:] = others
         mujoco.mj_rnePostConstraint(model, data)
+        self._time = float(data.time)
 
     def _observe(self, *args: Any, **kwargs: Any) -> Any:
         """In place of the task's own ``_get_obs``: the same, of what the sensors show."""
         self._called.add("_get_obs")
+        self._look_at_time()
         base: Any = self.unwrapped
         data = base.data
         qpos, qvel = data.qpos.copy(), data.qvel.copy()

@@ -13,6 +13,9 @@ from sb3_rpto.envs.copies import copy_env
 def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:
     """A copy of ``env`` with effects, for RPTO, SAC or anything; ``env`` is left alone.
 
+    The copy goes on from where ``env`` and its random numbers are: give several copies seeds of their own, as
+    ``make_vec_env`` does, or their episodes begin alike.
+
     :param env: a gymnasium MuJoCo environment, with all its wrappers; the copy draws no pictures and writes no files
         (for those ``StandingEnv(gym.make(..., render_mode=...), effects)`` of :mod:`sb3_rpto.effects.stance`)
     :param effects: with their values; they come on top of those that ``env`` has already

@@ -63,13 +63,25 @@ class StateMap:
                 "give the environment that they come from"
             )
         states = self.recover(observations)
+        try:
+            first = [*states][:4]
+            found = [np.shape(array) for array in first]
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"the state map of {self.env_name} returned {type(states).__name__}; it must return States(...)"
+            ) from error
         shapes = [(len(observations), size) for size in self.sizes] * 2
-        found = [np.shape(array) for array in states[:4]]
         if found != shapes:
             raise ValueError(f"the state map of {self.env_name} returned arrays of shapes {found}; expected {shapes}")
-        return states
+        qpos, qvel = (np.asarray(array, dtype=np.float64) for array in first[:2])
+        known_qpos, known_qvel = (np.asarray(array, dtype=bool) for array in first[2:])
+        return States(qpos, qvel, known_qpos, known_qvel, *[*states][4:])
 
 
+_NO_MAP = (
+    "register_state_map for {} was not given what makes a state map: a function of the environment that returns the "
+    "function of observations"
+)
 _registered: dict[str | type[gym.Env], Callable[[gym.Env], Recover]] = {}
 
 
@@ -211,7 +223,13 @@ def state_map(env: gym.Env) -> StateMap:
                 f"{name}: how its observations (written by {author.__name__}._get_obs) follow from the state is not "
                 f"known; tell it with register_state_map({key}, ...), in the module that registers the environment"
             )
-    return StateMap(name, (model.nq, model.nv), shape[0], make(env))
+    try:
+        recover: Any = make(env)
+    except (TypeError, IndexError) as error:
+        raise ValueError(f"{_NO_MAP.format(name)} ({error})") from error
+    if not callable(recover):
+        raise ValueError(_NO_MAP.format(name))
+    return StateMap(name, (model.nq, model.nv), shape[0], recover)
 
 
 def strange_wrapper(env: gym.Env) -> str | None:

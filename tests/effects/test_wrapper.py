@@ -181,6 +181,21 @@ def test_a_reset_forgets_everything():
     assert_same(run(wrapped, actions), first)
 
 
+def test_a_reset_by_a_wrapper_beneath_is_one():
+    late = [
+        CommandDelay("slide", delay=0.03),
+        LIBRARY["sensor_delay"]("hinge", delay=0.03),
+        LIBRARY["torque_offset"]("hinge", offset=0.4),
+    ]
+    beneath = CorrectedEnv(gym.wrappers.Autoreset(gym.make(POLE)), late)
+    above = gym.wrappers.Autoreset(CorrectedEnv(gym.make(POLE), late))
+    actions = actions_for(beneath, 40)
+    ends = [run(env, actions) for env in (beneath, above)]
+    assert sum(step[2] for step in ends[0][1:]) > 1
+    for one, other in zip(*ends, strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
+
+
 def test_the_effects_given_are_left_alone():
     given = CoulombFriction("slider", level=0.4)
     wrapped = CorrectedEnv(gym.make(POLE), [given])

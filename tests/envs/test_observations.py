@@ -181,6 +181,35 @@ def test_a_registered_map_of_wrong_shape_is_refused(monkeypatch):
         state_map(gym.make("Hopper-v5"))(np.zeros((2, 11)))
 
 
+def whole(obs):
+    return obs[:, :2], obs[:, 2:], np.ones((len(obs), 2)), np.ones((len(obs), 2))
+
+
+@pytest.mark.parametrize("as_given", [tuple, lambda arrays: States(*(array.tolist() for array in arrays))])
+def test_a_registered_map_may_return_what_reads_as_states(as_given, monkeypatch):
+    monkeypatch.setattr(module, "_registered", {})
+    register_state_map("InvertedPendulum-v5", lambda env: lambda obs: as_given(whole(obs)))
+    states = state_map(gym.make("InvertedPendulum-v5"))(np.arange(8.0).reshape(2, 4))
+    np.testing.assert_array_equal(states.qvel, [[2.0, 3.0], [6.0, 7.0]])
+    assert states.known_qpos.dtype == states.known_qvel.dtype == bool
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda env: None, "a function of the environment that returns the function of observations"),
+        (lambda obs: whole(obs), "a function of the environment that returns the function of observations"),
+        (lambda env: lambda obs: None, r"returned NoneType; it must return States"),
+        (lambda env: lambda obs: whole(obs)[:2], "returned arrays of shapes"),
+    ],
+)
+def test_a_registered_map_that_is_none_is_told(make, said, monkeypatch):
+    monkeypatch.setattr(module, "_registered", {})
+    register_state_map("InvertedPendulum-v5", make)
+    with pytest.raises(ValueError, match=said):
+        state_map(gym.make("InvertedPendulum-v5"))(np.zeros((2, 4)))
+
+
 def test_observations_of_another_env_are_refused():
     with pytest.raises(ValueError, match=r"Hopper-v5 have shape \(n, 11\)"):
         state_map(gym.make("Hopper-v5"))(np.zeros((2, 17)))
