@@ -275,6 +275,14 @@ def resume(model: Resumable) -> None:
     if state is None:
         return
     assert model.env is not None  # learn() has checked both worlds
+    began = 1 if model.target_env is None else model.target_env.num_envs
+    learned = state["last_obs"] is not None and model.num_timesteps > began and not model._offline
+    if learned and model.replay_buffer.target.size() == 0:
+        warnings.warn(
+            "the run goes on without its replay buffers, so D_target begins empty: call load_replay_buffer() with what "
+            "save_replay_buffer() wrote beside the checkpoint before learn()",
+            stacklevel=3,
+        )
     restarted = []
     if not _put_source_back(model, state):
         restarted.append("source")

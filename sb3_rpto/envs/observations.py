@@ -62,7 +62,7 @@ class StateMap:
                 f"observations of {self.env_name} have shape (n, {self.width}), not {observations.shape}; "
                 "give the environment that they come from"
             )
-        states = self.recover(observations)
+        states: Any = self.recover(observations)  # of a user's map anything
         try:
             first = [*states][:4]
             found = [np.shape(array) for array in first]

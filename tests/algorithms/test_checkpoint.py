@@ -147,6 +147,20 @@ def test_resuming_equals_not_having_stopped(case, tmp_path):
     assert_same(unbroken, resumed)
 
 
+@pytest.mark.parametrize("with_buffers", [True, False])
+def test_a_run_that_goes_on_without_its_buffers_is_told(with_buffers, tmp_path):
+    model = small(RPO).learn(20, source_timesteps=0)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    resumed = RPO.load(tmp_path / "model", env=pendulum(), target_env=pendulum(12.0), device="cpu")
+    if with_buffers:
+        resumed.load_replay_buffer(tmp_path / "buffer")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        resumed.learn(3, reset_num_timesteps=False)
+    assert any("goes on without its replay buffers" in str(one.message) for one in told) == (not with_buffers)
+
+
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs CUDA")
 def test_resuming_on_a_gpu_draws_the_numbers_that_were_next(tmp_path):
     model = small(RPTO, device="cuda").learn(30, source_timesteps=0)
