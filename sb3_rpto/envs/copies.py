@@ -55,8 +55,8 @@ def _clone(env: gym.Env, memo: dict[int, Any]) -> gym.Env:
         if isinstance(thing, np.ndarray) and thing.base is not None:
             _follow(thing, fields, memo)
     for thing in things:
-        if isinstance(thing, types.FunctionType) and thing.__closure__:
-            _rebind(thing, thing.__closure__, memo)
+        if isinstance(thing, types.FunctionType):
+            _twin_of(thing, memo)
     for layer in kept:
         twin = memo[id(layer)]
         for name, value in vars(layer).items():
@@ -97,25 +97,33 @@ def _cloned_simulation(layer: gym.Env, memo: dict[int, Any]) -> Iterator[tuple[n
                     yield field, getattr(twin, name)
 
 
-def _reachable(values: list[Any]) -> Iterator[np.ndarray | types.FunctionType]:
-    """Arrays and functions that are held, also by the helpers and collections that are."""
+def _reachable(values: list[Any]) -> Iterator[Any]:
+    """All that is held, also by the helpers, collections and functions that are."""
     seen: set[int] = set()
     while values:
         value = values.pop()
         if id(value) in seen or isinstance(value, type | types.ModuleType):
             continue
         seen.add(id(value))
-        if isinstance(value, np.ndarray | types.FunctionType):
-            yield value
-        elif isinstance(value, dict | list | tuple | set):
+        yield value
+        if isinstance(value, dict | list | tuple | set):
             if len(value) <= _LARGE:
                 values.extend(value.values() if isinstance(value, dict) else value)
         elif isinstance(value, functools.partial):
             values += [value.func, value.args, value.keywords]
         elif isinstance(value, types.MethodType):
             values.append(value.__self__)
+        elif isinstance(value, types.FunctionType):
+            values += [value.__defaults__, *map(_content, value.__closure__ or ())]
         elif hasattr(value, "__dict__"):
             values.append(vars(value))
+
+
+def _content(cell: types.CellType) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # of a name that is bound later
+        return None
 
 
 def _follow(array: np.ndarray, fields: Sequence[tuple[np.ndarray, np.ndarray]], memo: dict[int, Any]) -> None:
@@ -127,12 +135,24 @@ def _follow(array: np.ndarray, fields: Sequence[tuple[np.ndarray, np.ndarray]], 
             return
 
 
-def _rebind(function: types.FunctionType, closure: tuple[types.CellType, ...], memo: dict[int, Any]) -> None:
+def _twin_of(value: Any, memo: dict[int, Any]) -> Any:
+    """What takes the place of what a function holds: itself, unless it looks into the environment or its simulation."""
+    if id(value) not in memo and any(id(held) in memo for held in _reachable([value])):
+        if isinstance(value, types.FunctionType):
+            _rebind(value, memo)
+        else:
+            copy.deepcopy(value, memo)
+    return memo.get(id(value), value)
+
+
+def _rebind(function: types.FunctionType, memo: dict[int, Any]) -> None:
     """Let the copy of a function over the environment, or over its simulation, be that function over the copy."""
-    if not any(id(cell.cell_contents) in memo for cell in closure):
-        return
-    cells = tuple(types.CellType(memo.get(id(cell.cell_contents), cell.cell_contents)) for cell in closure)
-    twin = types.FunctionType(function.__code__, function.__globals__, function.__name__, function.__defaults__, cells)
+    cells = tuple(types.CellType() for _ in function.__closure__ or ())
+    twin = types.FunctionType(function.__code__, function.__globals__, function.__name__, None, cells)
+    memo[id(function)] = twin  # before what it holds, which may be itself
+    for cell, old in zip(cells, function.__closure__ or (), strict=True):
+        cell.cell_contents = _twin_of(_content(old), memo)
+    if function.__defaults__ is not None:
+        twin.__defaults__ = tuple(_twin_of(value, memo) for value in function.__defaults__)
     twin.__kwdefaults__ = function.__kwdefaults__
     vars(twin).update(vars(function))
-    memo[id(function)] = twin

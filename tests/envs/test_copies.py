@@ -69,6 +69,21 @@ class OverData(Tilting):
         return lambda: scale * data.qpos[1]
 
 
+class HeldByAFunction(Tilting):
+    def looking(self):
+        arm = Arm(self.model, self.data)
+
+        def angle(again=True):
+            return angle(again=False) if again else arm.angle()
+
+        return lambda: angle()
+
+
+class Default(Tilting):
+    def looking(self):
+        return lambda data=self.data: data.qpos[1]
+
+
 class Partial(Tilting):
     def looking(self):
         return functools.partial(_angle, self.data)
@@ -92,7 +107,16 @@ class Named(Tilting):
         return lambda: self.hinge.qpos[0]
 
 
-WORLDS = [Helper, View, Closure, OverData, Partial, lambda: Watching(gym.make("InvertedPendulum-v5").unwrapped)]
+WORLDS = [
+    Helper,
+    View,
+    Closure,
+    OverData,
+    HeldByAFunction,
+    Default,
+    Partial,
+    lambda: Watching(gym.make("InvertedPendulum-v5").unwrapped),
+]
 
 
 def episode(env: gym.Env) -> list[tuple]:
