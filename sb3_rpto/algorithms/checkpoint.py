@@ -109,9 +109,7 @@ class Resumable(TwoWorlds):
                 f"{path} holds observations and actions of shapes {shapes[0]}, the model's are {shapes[1]}; load the "
                 "buffers that were saved beside it"
             )
-        if (
-            self.replay_buffer.estimated and self.target_env is not None
-        ):  # which took the log's place after it was saved
+        if self.replay_buffer.estimated and self.target_env is not None:  # a target has taken the log's place
             self._drop_target_data()
 
     @classmethod

@@ -299,9 +299,12 @@ def with_numbers(env: gym.Env, model: mujoco.MjModel | None) -> gym.Env:
     """An environment that was made anew, with what had been written to its model since it was first made."""
     from sb3_rpto.effects.model import numbers, set_number  # which imports this module
 
+    if model is None:
+        return env
     base: Any = env.unwrapped
-    for name, value in ({} if model is None else numbers(model)).items():
-        if not np.array_equal(value, numbers(base.model)[name], equal_nan=True):
+    mine = numbers(base.model)
+    for name, value in numbers(model).items():
+        if not np.array_equal(value, mine[name], equal_nan=True):
             set_number(base.model, name, list(range(value.size)), value.ravel().tolist())
     return env
 

@@ -49,7 +49,8 @@ def _clone(env: gym.Env, memo: dict[int, Any]) -> gym.Env:
     inner = memo[id(kept[-1])]
     for layer in reversed(layers(env)):
         inner = memo.setdefault(id(layer), inner)  # in the place of one that draws is what it wraps
-    fields = [pair for layer in kept for pair in _cloned_simulation(layer, memo)]
+    # The innermost first, as it has the model of its data.
+    fields = [pair for layer in reversed(kept) for pair in _cloned_simulation(layer, memo)]
     things = list(_reachable([vars(layer) for layer in kept]))
     for thing in things:
         if isinstance(thing, np.ndarray) and thing.base is not None:

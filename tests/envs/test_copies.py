@@ -94,7 +94,7 @@ class Watching(gym.Wrapper):
 
     def __init__(self, env) -> None:
         super().__init__(env)
-        self.model, self.data = env.unwrapped.model, env.unwrapped.data
+        self.data = env.unwrapped.data
 
     def step(self, action):
         observation, _, _, truncated, info = super().step(action)
