@@ -6,10 +6,13 @@ BIN := .venv/bin
 
 setup: .venv/.ready
 
+# Not compiled: of all that is installed a small part is ever imported, and is compiled then.
+PIP := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt
+
 .venv/.ready: setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	$(PIP) torch
+	$(PIP) --editable ".[dev]"
 	touch $@
 
 demo: setup
