@@ -424,6 +424,7 @@ def test_training_returns_decide_without_the_callback():
     assert model.best_mean_reward > -1e5
 
 
+@pytest.mark.slow
 def test_training_and_evaluation_are_never_compared(tmp_path):
     model = small(RPO, target=short_pendulum())
     model.learn(40, source_timesteps=0)
@@ -445,6 +446,7 @@ def test_keep_best_belongs_into_an_evaluation():
         small(RPO).learn(5, KeepBest(), source_timesteps=0)
 
 
+@pytest.mark.slow
 def test_keep_best_may_be_one_of_several_in_an_evaluation():
     both = CallbackList([KeepBest(), StopTrainingOnRewardThreshold(0.0)])
     model = small(RPO).learn(30, EvalCallback(pendulum(12.0), both, eval_freq=10, verbose=0), source_timesteps=0)

@@ -85,6 +85,7 @@ def test_trace_robot_draws_by_seed(trace_robot):
     assert not any(inside(seed, False)[1] for seed in range(5))
 
 
+@pytest.mark.slow
 def test_robot_log_to_policy_goes_from_a_log_to_a_policy(monkeypatch, tmp_path, capsys):
     example = load("robot_log_to_policy", monkeypatch)
     monkeypatch.setattr(windows, "LONGEST", 0.005)

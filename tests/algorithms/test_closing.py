@@ -340,9 +340,8 @@ def test_the_corrected_simulator_comes_back_from_a_checkpoint(tmp_path: Path) ->
     assert loaded.loop.found[0]["verdict"] == "explained"
 
 
-@pytest.mark.parametrize(
-    "stop", [pytest.param(60, id="before the trace"), pytest.param(90, id="after it", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [pytest.param(60, id="before the trace"), pytest.param(90, id="after it")])
 def test_a_loop_that_was_stopped_goes_on_as_if_it_had_not_been(stop: int, soon: None, tmp_path: Path) -> None:
     def begun() -> RPTO:
         return model(friction(), close_loop=["coulomb_friction"]).learn(stop, source_timesteps=100)
@@ -631,6 +630,7 @@ def test_encoder_zeros_that_differ_by_run_are_taken_off_the_log(monkeypatch: pyt
     np.testing.assert_array_equal(made.transitions("target").observations[:, 0], homed)
 
 
+@pytest.mark.slow
 def test_a_budget_of_source_steps_is_not_exceeded_by_the_loop(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded = filled(friction()).replay_buffer
     made = model([], target_data=recorded)
@@ -992,6 +992,7 @@ def test_a_judged_policy_that_was_stopped_goes_on_as_if_it_had_not_been(
     np.testing.assert_array_equal(end(resumed), goes_on)
 
 
+@pytest.mark.slow
 def test_a_judged_policy_acts_where_learning_was_interrupted_and_nothing_is_learned_twice(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -1315,6 +1316,7 @@ def test_a_policy_is_rehearsed_where_a_log_was_traced_and_no_step_of_the_budget_
     assert made.num_timesteps == 60
 
 
+@pytest.mark.slow
 def test_a_policy_that_stays_is_not_sent_to_learn_in_the_corrected_simulator(
     soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -106,6 +106,7 @@ def test_joints_in_another_order_are_doubted_once():
         made.learn(45, reset_num_timesteps=False)
 
 
+@pytest.mark.slow
 def test_a_number_at_its_bound_is_doubted():
     made = model(shifted(0.7), "pole.length=0.55:0.65")
     with pytest.warns(UserWarning, match=r"after the fit pole\.length = 0\.65 lies at its bound: do the target's"):

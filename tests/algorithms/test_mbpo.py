@@ -30,6 +30,7 @@ def test_model_and_data_are_rtos_without_weights():
     assert_same_worlds(ours, theirs)
 
 
+@pytest.mark.slow
 def test_with_the_critics_batch_for_the_actor_rpto_without_weights_is_mbpo(monkeypatch):
     ours = small(MBPO).learn(60, source_timesteps=0)
     theirs = small(RPTO, **UNWEIGHTED)

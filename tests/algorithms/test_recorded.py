@@ -348,6 +348,7 @@ def test_a_log_that_is_too_short_to_trace_is_named_before_anything_is_learned() 
     assert made.num_timesteps == 0
 
 
+@pytest.mark.slow
 def test_with_the_loop_open_the_declared_numbers_alone_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
     fits: list[int] = []
     monkeypatch.setattr(PhysicalDynamics, "fit", lambda *_, **__: fits.append(1))

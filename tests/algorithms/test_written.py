@@ -128,6 +128,7 @@ def test_losses_of_a_subclass_are_what_is_descended(name):
     assert len(asked) == model._n_updates > 0
 
 
+@pytest.mark.slow
 def test_losses_put_in_place_of_a_models_are_what_is_descended(monkeypatch):
     model, asked = small(RPO), []
     monkeypatch.setattr(model, "critic_loss", lambda *given: (asked.append(1), RPO.critic_loss(model, *given))[1])

@@ -235,6 +235,7 @@ def test_enjoy_prints_what_the_policy_earns(agent: Path, capsys: pytest.CaptureF
     assert printed[2].endswith("2 episodes")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
 def test_a_film_shows_three_panels(suffix: str, agent: Path, tmp_path: Path) -> None:
     imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")

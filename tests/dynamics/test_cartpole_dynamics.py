@@ -241,6 +241,7 @@ def test_equal_worlds_keep_phi(declared):
     assert dynamics.coordinates.abs().max() < 1e-6
 
 
+@pytest.mark.slow
 def test_standard_errors_match_the_spread_over_noise():
     clean = collect(200, pole_length=1.2)
     noise = th.tensor([1e-4, 1e-2, 1e-4, 3e-2])  # unequal: the plain Gauss-Newton error would be wrong

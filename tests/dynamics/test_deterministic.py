@@ -144,6 +144,7 @@ def test_an_ended_episode_is_not_followed(monkeypatch):
     assert 0 < continues[0].float().mean() < 1
 
 
+@pytest.mark.slow
 def test_terminations_are_learned_where_the_rule_is_unknown():
     with pytest.warns(UserWarning, match="terminations"):
         model = make(termination_fn=None)

@@ -308,6 +308,7 @@ def test_weights_count_for_the_rows_they_belong_to():
     np.testing.assert_array_equal(task.robust(np.ones((23, 11)))[~np.isin(steps.rows, good)], 0)
 
 
+@pytest.mark.slow
 def test_the_deviation_is_that_of_repeated_fits():
     """Noise on what is reached: the spread of the fits is what each of them says of itself."""
     clean = collect(shifted(POLE, {"pole.mass": 7.0}), 40)

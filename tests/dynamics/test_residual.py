@@ -147,6 +147,7 @@ def test_negligible_errors_are_left_alone():
     assert make().fit(replace(exact, next_observations=exact.next_observations + 100 * off))["residual_on"] == 1.0
 
 
+@pytest.mark.slow
 def test_a_later_fit_switches_off_what_no_longer_helps(fitted):
     assert fitted.corrected.any()
     log = fitted.fit(collect("InvertedPendulum-v5", 100, seed=2, missing=False))
@@ -214,6 +215,7 @@ def test_deterministic_answers_ignore_the_noise(data):
 # --- the fit ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_missed_touch_downs_do_not_drown_the_rest(data):
     jumps = th.zeros_like(data.observations)
     jumps[::50] = 20.0

@@ -315,6 +315,7 @@ def test_an_unknown_environment_has_no_rules():
     assert task_rules(gym.make("elsewhere/Hopper-v0", disable_env_checker=True)) == TaskRules(None, None)
 
 
+@pytest.mark.slow
 def test_an_environment_in_another_process():
     pytest.importorskip("gymnasium.envs.mujoco.hopper_v5", exc_type=ImportError)
     kwargs = {"healthy_z_range": (1.1, 1.3)}

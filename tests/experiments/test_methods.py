@@ -188,6 +188,7 @@ def test_trpo_warm_starts_as_the_sac(source_model: str) -> None:
     assert model.n_steps == 250
 
 
+@pytest.mark.slow
 def test_further_critics_agree_with_the_sources_and_are_their_own(source_model: str) -> None:
     data, _ = baselines.source_transitions(source_model, cartpole(), 0)
     source = SAC.load(source_model)

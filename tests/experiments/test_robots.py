@@ -38,6 +38,7 @@ def test_sizes(kind: str, value: float) -> None:
     assert planted(Job("InvertedPendulum-v5", kind))[-1].values == pytest.approx([value])
 
 
+@pytest.mark.slow
 def test_every_robot_and_kind_can_be_made_and_moves() -> None:
     for robot in ROBOTS:
         for kind in CAUSES:

@@ -226,6 +226,7 @@ def test_cells_differ_in_their_factors_alone() -> None:
     assert all({v.seeds for v in place.variants} == {3} for place in ABLATION.places)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_without_rpo_and_weights_it_is_mbpo() -> None:
     """From states of the target alone; number for number."""

@@ -83,6 +83,7 @@ def test_a_fit_without_free_parameters_stays() -> None:
     assert concentrated(problem, fit, np.empty(0, dtype=int)) is fit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_it_never_ends_higher_than_it_began(seed: int) -> None:
     problem = lengths()

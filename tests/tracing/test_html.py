@@ -130,6 +130,7 @@ def test_only_an_explanation_is_claimed(report: Report, verdict: str, monkeypatc
     assert ("not claimed as the explanation" in words) == (verdict != "explained")
 
 
+@pytest.mark.slow
 def test_the_same_report_gives_the_same_page(page: str, report: Report) -> None:
     assert render(report) == page
 

@@ -215,6 +215,7 @@ def test_what_is_missing_shows_in_spite_of_the_noise() -> None:
     assert fit.values[0] == pytest.approx(0.08, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_floor_is_what_a_true_model_errs_by() -> None:
     noise = Noise(np.array([1e-3]), np.array([3e-2]))
     data = shaken(noise, episodes=12)
@@ -237,6 +238,7 @@ def friction() -> Effect:
 KINDS = ["coulomb_friction", "torque_offset"]
 
 
+@pytest.mark.slow
 def test_a_trace_of_noisy_states_names_what_is_missing() -> None:
     env = gym.make(TASK)
     data = Measurements.from_replay(seen([friction()], 150), env, noise=NOISE)

@@ -48,6 +48,7 @@ def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
     assert Likes(s, found).simplest(rich, Selection(rich)).effects == (0,)
 
 
+@pytest.mark.slow
 def test_one_takes_the_place_of_two_where_its_first_fit_had_failed() -> None:
     """Beside one that can stand for one of the two the other is needless, which a bad fit of it alone would hide."""
     effects: list[Effect] = [CoulombFriction("hinge"), ViscousFriction("hinge"), StribeckFriction("hinge")]

@@ -177,6 +177,7 @@ def test_quaternions_of_one_orientation_are_given_one_sign() -> None:
     assert [f.kind for f in data.findings] == ["quaternion sign"]
 
 
+@pytest.mark.slow
 def test_narrow_bounds_hold_the_fit_and_the_report() -> None:
     data = recorded(model=compiled(PENDULUM.replace('mass="0.5"', 'mass="0.4"')), episodes=6, noise=0.0, exact=True)
     report = trace(PENDULUM, data, ["pole.mass=0.49:0.51"], candidates=[], threads=1)

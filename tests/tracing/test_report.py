@@ -134,6 +134,7 @@ def test_a_model_whose_mjcf_is_unknown_is_refused_and_nothing_written(report: Re
     assert not (tmp_path / "out" / "report.json").exists()
 
 
+@pytest.mark.slow
 def test_the_model_that_was_traced_is_not_overwritten(report: Report, planted, tmp_path: Path) -> None:
     """Though an earlier trace saved it, and the report holds it as it was."""
     report.save(tmp_path)

@@ -343,6 +343,7 @@ def test_looking_forward_brings_a_wrongly_dropped_effect_back() -> None:
     assert COULOMB not in found.dropped
 
 
+@pytest.mark.slow
 def test_a_larger_model_begins_at_the_smaller_ones_optimum_and_is_never_worse() -> None:
     s = selector([CoulombFriction("hinge", level=0.04), TorqueOffset("hinge", offset=0.02)], seed=5)
     small = s.model((), s.train.score(s.train.null))

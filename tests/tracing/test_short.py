@@ -34,6 +34,7 @@ def transitions(env: gym.Env, n: int) -> ReplayBuffer:
     return buffer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [(), MOTORS], ids=["complete", "late-motors"])
 def test_a_second_and_a_half_of_a_simulator_are_enough(late) -> None:
     """Late commands of all motors look like late sensors of all joints; fewer and exact is what acts."""

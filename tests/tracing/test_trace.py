@@ -486,6 +486,7 @@ def test_what_is_no_whole_number_is_refused(name: str, wrong: Any) -> None:
         trace(COARSE, simple(), **{name: wrong})
 
 
+@pytest.mark.slow
 def test_how_test_runs_were_sampled_changes_nothing_of_the_fit() -> None:
     made = planted(("coulomb_friction", "large"))
 
@@ -565,12 +566,14 @@ def test_a_known_effect_is_fitted_and_what_else_is_missing_is_named(tmp_path: Pa
         assert [e.label for e in again] == ["pole.mass", "command_delay(motor)", "coulomb_friction(hinge)"]
 
 
+@pytest.mark.slow
 def test_with_all_effects_known_a_model_is_complete() -> None:
     report = with_known(late(0.08), CommandDelay("motor", delay=0.02), CoulombFriction("hinge", level=0.05))
     assert report.verdict == "complete"
     assert report.declared[2].effect.values[0] == pytest.approx(0.08, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_known_effect_that_is_not_there_ends_at_its_null() -> None:
     report = with_known(few(5), CommandDelay("motor", delay=0.03), CoulombFriction("hinge", level=0.05))
     assert report.verdict == "complete"

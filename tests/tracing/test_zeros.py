@@ -79,6 +79,7 @@ def test_what_all_runs_have_beyond_chance_is_a_bias_of_the_sensor() -> None:
     np.testing.assert_allclose(differences(report, 0.3), -mean, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_report_says_them() -> None:
     report = traced(0.0, 1.0)
     run = report.zeros.runs[0]
