@@ -70,7 +70,8 @@ def run(parsed: argparse.Namespace) -> int:
     simulator = world.make()
     recordings.check_out(parsed.out, simulator)
     known = recordings.known(parsed.known, simulator)
-    declared = [*parsed.declare, *(e.label for e in known if isinstance(e, Declared) and e.label not in parsed.declare)]
+    # What the user declares comes last: its bounds are those that count.
+    declared = [*(effect.label for effect in known if isinstance(effect, Declared)), *parsed.declare]
     effects = [e.to_json() for e in known if not isinstance(e, Declared)]
     if effects:
         own = settings.get("dynamics_kwargs", {})

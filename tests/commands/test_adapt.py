@@ -73,13 +73,17 @@ def test_a_log_becomes_a_report_a_simulator_and_a_policy(given: Path, tmp_path: 
 
 @pytest.mark.slow
 def test_what_is_known_is_fitted_and_not_found_again(given: Path, tmp_path: Path) -> None:
-    (tmp_path / "known.json").write_text(json.dumps([LIBRARY["torque_offset"]("hinge", offset=0.3).to_json()]))
-    assert adapt(given, tmp_path / "out", "--known", str(tmp_path / "known.json"), "--declare", "pole.mass") == 0
+    mass = {"kind": "declared", "on": "", "values": {"pole.mass": 5.5}}
+    known = [mass, LIBRARY["torque_offset"]("hinge", offset=0.3).to_json()]
+    (tmp_path / "known.json").write_text(json.dumps(known))
+    assert adapt(given, tmp_path / "out", "--known", str(tmp_path / "known.json"), "--declare", "pole.mass=4:6") == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert (report["verdict"], report["effects"]) == ("complete", [])
-    known = {entry["label"]: entry["parameters"] for entry in report["declared"]}
-    assert known["torque_offset(hinge)"]["offset"]["value"] == pytest.approx(0.5, rel=0.02)
-    assert known.keys() == {"pole.mass", "torque_offset(hinge)"}
+    fitted = {entry["label"]: entry["parameters"] for entry in report["declared"]}
+    assert fitted["torque_offset(hinge)"]["offset"]["value"] == pytest.approx(0.5, rel=0.02)
+    assert fitted.keys() == {"pole.mass", "torque_offset(hinge)"}
+    loop = RPTO.load(tmp_path / "out" / "model.zip", device="cpu").loop
+    assert loop.declared == ("pole.mass", "pole.mass=4:6")  # the bounds are those that the user gave
 
 
 @pytest.mark.slow
