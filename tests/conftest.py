@@ -1,4 +1,5 @@
 import os
+import pickle
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -6,6 +7,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import gymnasium as gym
 import pytest
 import torch as th
+from filelock import FileLock
 from hypothesis import settings
 
 from sb3_rpto import RPO, RPTO, RTO
@@ -59,6 +61,12 @@ def planted() -> Planted:
 
 
 @pytest.fixture(scope="session")
-def report(planted: Planted) -> Report:
-    """What a trace of it finds; not to be changed."""
-    return trace(planted.xml, planted.measurements, planted.declared, candidates=TRACED)
+def report(planted: Planted, tmp_path_factory: pytest.TempPathFactory) -> Report:
+    """What a trace of it finds; not to be changed. Of the processes that share a run's tests one traces."""
+    root = tmp_path_factory.getbasetemp()
+    file = (root.parent if "PYTEST_XDIST_WORKER" in os.environ else root) / "report.pickle"
+    with FileLock(f"{file}.lock"):
+        if not file.exists():
+            found = trace(planted.xml, planted.measurements, planted.declared, candidates=TRACED)
+            file.write_bytes(pickle.dumps(found))
+        return pickle.loads(file.read_bytes())

@@ -92,6 +92,7 @@ def exact(ratio):
 # ------------------------------------------------------------------------------------ gap/dynamics
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:target_env has stepped exactly like env")
 def test_equal_worlds_have_no_dynamics_gap():
     log = gaps(50, world(0.8), world(0.8), **exact(0.8))

@@ -73,6 +73,7 @@ def test_trace_robot_writes_logs_that_tell_no_more_than_a_robots_would(trace_rob
     assert trace_robot.robot(seed=4, episodes=2, duration=0.5)[1:3] == (xml, declared)
 
 
+@pytest.mark.slow
 def test_trace_robot_draws_by_seed(trace_robot):
     def inside(seed: int, library: bool) -> tuple[str, bool]:
         label, effect, _ = trace_robot.robot(seed, 1, 0.1, library)[3].open()

@@ -164,6 +164,7 @@ def trained(zoo, tmp_path_factory) -> Path:
     return launch(folder, "rpo", "-n", "40", "--source-timesteps", "120", *evaluation, *saving, *COLD)
 
 
+@pytest.mark.slow
 def test_training_is_judged_on_the_target(trained):
     model = RPO.load(final(trained), device="cpu")
     assert model.num_timesteps == 40

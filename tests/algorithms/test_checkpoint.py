@@ -116,7 +116,15 @@ CASES = {
 
 
 #: Others go through the same code.
-SLOW_CASES = ("rto-pendulum", "rpo-mujoco", "rpto-residual", "rpto-gsde", "physical-normalised", "rpo-normalised")
+SLOW_CASES = (
+    "rpo-pendulum",
+    "rto-pendulum",
+    "rpo-mujoco",
+    "rpto-residual",
+    "rpto-gsde",
+    "physical-normalised",
+    "rpo-normalised",
+)
 
 
 @pytest.mark.parametrize(
@@ -334,6 +342,7 @@ def test_branches_of_a_checkpoint_see_other_resets(tmp_path):
         assert (one != other).any(axis=1).all()
 
 
+@pytest.mark.slow
 def test_a_randomised_simulator_draws_anew_for_a_new_seed(tmp_path):
     cls, source, target, kwargs = CASES["rpto-physical-mujoco"]
     model = small(cls, source(), target(), **kwargs).learn(60, source_timesteps=40)

@@ -304,6 +304,7 @@ def test_noisy_transitions_are_traced_once_more_when_they_fill_all_windows(
     assert loop.due(made, phi) is due  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_checkpoint_knows_the_noise(tmp_path: Path) -> None:
     made = learned_from_noise()
     made.save(tmp_path / "model")
@@ -930,6 +931,7 @@ def judged(monkeypatch: pytest.MonkeyPatch, every: int = 40, earns: Callable[[],
     return made
 
 
+@pytest.mark.slow
 def test_between_fits_the_policy_stays_as_the_simulator_judged_it(monkeypatch: pytest.MonkeyPatch) -> None:
     made, seen = judged(monkeypatch, earns=count(1.0).__next__), Watch()
     updates, source = made._n_updates, made.source_timesteps
@@ -1400,7 +1402,7 @@ def test_a_source_that_was_corrected_already_is_refused(soon: None, tmp_path: Pa
     assert made.env is before
 
 
-@pytest.mark.parametrize("first", ["the buffer", "the target"])
+@pytest.mark.parametrize("first", ["the buffer", pytest.param("the target", marks=pytest.mark.slow)])
 def test_a_target_after_a_log_begins_without_the_logs_estimates(first: str, soon: None, tmp_path: Path) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured).learn(40, source_timesteps=0)

@@ -133,7 +133,11 @@ class Fragile(gym.Wrapper):
     ("change", "said"),
     [
         (Fragile, r"termination_fn is not that of \d+ of 30 target transitions; pass .*'termination_fn'"),
-        (lambda env: TransformReward(env, lambda r: r + 30), r"reward_fn is not that of 30 of 30 .*'reward_fn'"),
+        pytest.param(
+            lambda env: TransformReward(env, lambda r: r + 30),
+            r"reward_fn is not that of 30 of 30 .*'reward_fn'",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             lambda env: TransformReward(env, lambda r: 1.5 * r),
             r"reward_fn is not that of \d+ of 30",

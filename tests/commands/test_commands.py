@@ -129,7 +129,9 @@ def test_a_finished_run_is_not_repeated_and_not_overwritten(agent: Path, capsys:
 # ---------------------------------------------------------------------- transfer
 
 
-@pytest.mark.parametrize("method", SETTINGS)
+@pytest.mark.parametrize(
+    "method", [pytest.param(m, marks=pytest.mark.slow if m in ("slbo", "trpo-warm") else ()) for m in SETTINGS]
+)
 def test_every_kind_of_method_leaves_model_and_result(method: str, agent: Path, tmp_path: Path) -> None:
     assert transfer(agent, tmp_path, method) == 0
     steps = [row["steps"] for row in rows(tmp_path)]

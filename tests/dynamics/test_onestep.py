@@ -242,6 +242,7 @@ def test_a_step_lowers_the_cost_within_its_trusted_size(poles, max_step):
         assert np.abs((moved - task.simulation.null) / task.scale).max() == pytest.approx(2 * max_step, rel=max_step)
 
 
+@pytest.mark.slow
 def test_a_number_far_above_its_nominal_value_moves_by_shares_of_what_it_is():
     task = problem(steps_of(collect(shifted(POLES, {"slider.damping": 1.0}), 60), POLES), ["slider.damping"], POLES)
     nominal = float(task.simulation.null[0])

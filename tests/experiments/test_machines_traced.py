@@ -33,6 +33,7 @@ def traced(name: str, kinds: list[str]) -> Report:
     return trace(machine.xml, machine.data, machine.declared, seed=0, candidates=kinds)
 
 
+@pytest.mark.slow
 def test_a_real_pendulum_lacks_dry_friction() -> None:
     report = traced("simple_pendulum", ["coulomb_friction", "torque_offset", "command_delay"])
     assert [t.effect.kind for t in report.effects] == ["coulomb_friction"]

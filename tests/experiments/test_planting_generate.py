@@ -110,7 +110,9 @@ def test_jittered_clock_is_recorded_truly():
         np.testing.assert_allclose(mean, (episode.qvel[1:, 0] + episode.qvel[:-1, 0]) / 2, atol=5e-3)
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "cartpole" else pytest.mark.slow) for name in SYSTEMS]
+)
 def test_motion_is_sensible_and_commands_span_small_and_large(name):
     planted = generate(name, [("coulomb_friction", "small")], 2)
     assert planted.measurements.findings == []

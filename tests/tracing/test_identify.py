@@ -396,6 +396,7 @@ def counted(p: Problem, monkeypatch: pytest.MonkeyPatch, crude: float) -> tuple[
         return p.fit(p.null, np.arange(2), iterations=20, tolerance=1e-6, crude=crude), len(calls)
 
 
+@pytest.mark.slow
 def test_fits_far_from_the_noise_end_sooner_and_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     near = declared_problem()
     (soon, calls), (late, others) = (counted(near, monkeypatch, crude) for crude in (CRUDE, 0.0))

@@ -80,6 +80,7 @@ def test_kinds_are_given_up_where_the_nearest_hardly_helps() -> None:
     assert looked == ["torque_offset at all places", "coulomb_friction at all places"]
 
 
+@pytest.mark.slow
 def test_a_kind_that_meets_exact_data_ends_the_search_before_single_effects_are_looked_for() -> None:
     s = selector([CoulombFriction("hinge", level=0.08)])
     s.look_forward = None  # type: ignore[method-assign, assignment]

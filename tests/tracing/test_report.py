@@ -196,6 +196,7 @@ def test_equations_have_numbers_for_names() -> None:
     assert wording.with_numbers(Payload("pole", mass=0.1)) == f"{Payload.equation} with mass 0.1 kg, along 2"
 
 
+@pytest.mark.slow
 def test_a_report_pickles(report: Report, tmp_path: Path) -> None:
     for other in (pickle.loads(pickle.dumps(report)), copy.deepcopy(report)):
         assert str(other) == str(report)

@@ -241,7 +241,9 @@ def test_near_the_noise_evidence_must_be_clearer_far_from_it_the_gain_larger() -
     assert s.limit(far) == (LIKELY, TENTH)
 
 
-@pytest.mark.parametrize(("joint_stuck", "few_stuck"), [(False, False), (True, False), (True, True)])
+@pytest.mark.parametrize(
+    ("joint_stuck", "few_stuck"), [(False, False), pytest.param(True, False, marks=pytest.mark.slow), (True, True)]
+)
 def test_a_joint_fit_that_is_no_better_than_none_gives_way_to_the_best_few_kinds_and_these_to_effects_one_by_one(
     joint_stuck: bool, few_stuck: bool
 ) -> None:
@@ -296,6 +298,7 @@ def test_one_of_its_class_may_take_the_place_of_what_is_added() -> None:
     assert s.look_forward(Selection(base), [DRAG], rounds=1, alike=lambda e: [COULOMB]).model.effects == (COULOMB,)
 
 
+@pytest.mark.slow
 def test_a_shape_that_hides_an_effect_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """The declared damping takes the mean friction; the rest is less than nothing where the null phase has it most."""
     there = PositionFriction("hinge", amplitude=0.1, phase=2.9)

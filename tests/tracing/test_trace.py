@@ -205,6 +205,7 @@ def test_of_what_looks_alike_one_is_tried_for_all() -> None:
     assert other.reason == f"looks like {tried.label}, which was tried"
 
 
+@pytest.mark.slow
 def test_an_effect_that_is_not_among_the_candidates_is_not_explained() -> None:
     report = traced_simply(kinds=["torque_offset"])
     assert report.verdict == "unexplained"
@@ -295,6 +296,7 @@ def test_a_single_block_to_select_on_is_no_evidence_so_that_all_take_turns() -> 
     assert found.effect.values[0] == pytest.approx(0.08, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_single_run_is_traced_and_reported_as_not_held_out() -> None:
     report = traced_simply(few(1, 3.6))
     assert report.runs["test"] == []

@@ -89,6 +89,7 @@ def test_the_report_says_them() -> None:
     assert "run zeros" in {f.kind for f in report.findings}
 
 
+@pytest.mark.slow
 def test_recordings_lose_the_zeros_of_their_runs_alone() -> None:
     zeros = traced(0.0, 1.0).zeros
     plain = zeros.taken_off(shifted(runs(), ZEROS))
