@@ -26,6 +26,7 @@ from sb3_rpto.experiments.run import METHODS, transfer
 from sb3_rpto.presets import resolve_preset
 
 BUDGET, EPISODES = 60, 2
+LONG = ("rto", "sac-warm-high", "slbo", "ptp", "pdml")
 
 
 def cartpole(**parameters: float) -> gym.Env:
@@ -97,7 +98,7 @@ def test_all_methods_of_the_command_line_are_there() -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [pytest.param(m, marks=pytest.mark.slow if m in LONG else ()) for m in METHODS])
 def test_a_method_spends_its_budget_exactly_and_says_what_it_took(method: str, source_model: str) -> None:
     rows = run(method, source_model)
     evaluated, trained = Counted.made[:EPISODES], Counted.made[EPISODES:]

@@ -28,7 +28,13 @@ def complete():
     return generate("double_pendulum", None, 0, **SHORT)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+#: One kind of five in the quick tests.
+every_kind = pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.slow if i % 5 else ()) for i, kind in enumerate(KINDS)]
+)
+
+
+@every_kind
 def test_every_effect_changes_what_is_measured(kind, complete):
     small, large = (generate("double_pendulum", [(kind, size)], 0, **SHORT) for size in ("small", "large"))
     shift = [np.sqrt(np.mean((measured(p)[:2] - measured(complete)[:2]) ** 2)) for p in (small, large)]
@@ -40,7 +46,7 @@ def test_every_effect_changes_what_is_measured(kind, complete):
     assert small.xml == complete.xml
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@every_kind
 def test_null_effect_leaves_the_data_as_they_are(kind, complete):
     np.testing.assert_array_equal(
         measured(generate("double_pendulum", [(kind, "null")], 0, **SHORT)), measured(complete)
