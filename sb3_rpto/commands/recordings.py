@@ -30,7 +30,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="parameters that may be fitted: hinge.damping, pole.mass, '*.damping', arm.mass=0.2:0.9; repeatable",
     )
     parser.add_argument(
-        "--candidates", metavar="K1,K2", type=names, help="kinds of effects to look for (default: all in the library)"
+        "--candidates", metavar="K1,K2", type=names, help="kinds of effects to look for (default: all that are offered)"
     )
     parser.add_argument(
         "--known",

@@ -277,7 +277,8 @@ def _effects(table: pd.DataFrame) -> str:
 
 def _explained() -> str:
     words = {
-        "runs": "that are done; unequal numbers are of an unfinished suite, or of methods with more seeds.",
+        "runs": "that are done; unequal numbers are of an unfinished suite, or of methods with more seeds. "
+        "Of one run a target no interval is told.",
         "P(A better)": "a run of A ends with a higher return than one of the line's method; ties count half.",
         f"target steps to {SHARE_WORDS}": "median over runs of the first evaluation with at least that share of the "
         "oracle's return, and how many runs had one. Censored at the budget: > means that half of the runs did not get "
@@ -300,7 +301,9 @@ def _interval(line: pd.Series, name: str, digits: int = 2, bounds: tuple[str, st
     if not np.isfinite(values).all():
         return "–"
     middle, lower, upper = (f"{value:,.{digits}f}" for value in values)
-    return f"{middle} [{lower}, {upper}]"
+    # One run a target tells nothing of how runs differ.
+    alone = "runs" in line and line["runs"] == line.get("places", 1)
+    return middle if alone else f"{middle} [{lower}, {upper}]"
 
 
 def _grid(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

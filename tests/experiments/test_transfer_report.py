@@ -223,6 +223,14 @@ def test_what_does_not_count_is_said(folder: Path) -> None:
     assert "Left out, of another source agent: Hopper_target0_sac-warm_5." in text
 
 
+def test_a_single_run_has_no_interval(folder: Path) -> None:
+    together, ant, hopper = tables.write(folder).split("\n## ")[2:5]
+    assert (hopper.split("\n")[0], ant.split("\n")[0]) == ("Hopper target0", "Ant target1")
+    assert "[" in next(line for line in hopper.splitlines() if line.startswith("| sac-warm"))
+    assert "[" not in next(line for line in ant.splitlines() if line.startswith("| sac-warm"))
+    assert "[" in next(line for line in together.splitlines() if line.startswith("| sac-warm"))
+
+
 def test_small_gaps_are_pointed_out(folder: Path) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["references"]["Hopper_target0"] |= {"zero_shot": 299.0}
