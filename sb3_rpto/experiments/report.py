@@ -140,8 +140,8 @@ def improvements(rows: pd.DataFrame, ours: Sequence[str]) -> pd.DataFrame:
 
     :param rows: columns task, target, label, seed, steps, return
     :param ours: labels
-    :return: columns task, target, steps, ours, other, probability, low, high; task and target are "all" for the last
-        evaluations on all targets together, steps then the largest budget
+    :return: columns task, target, steps, ours, other, runs (of both), places, probability, low, high; task and target
+        are "all" for the last evaluations on all targets together, steps then the largest budget
     """
     later = rows[rows["steps"] > 0]
     budget = later.groupby(PLACE)["steps"].transform("max")
@@ -157,9 +157,11 @@ def improvements(rows: pd.DataFrame, ours: Sequence[str]) -> pd.DataFrame:
                 if label == our and (other, *place) in of
             ]
             if pairs and our != other:
-                line = dict(zip((*PLACE, "steps"), key)) | {"ours": our, "other": other}
+                counts = {"runs": sum(len(x) + len(y) for x, y in pairs), "places": len(pairs)}
+                line = dict(zip((*PLACE, "steps"), key)) | {"ours": our, "other": other} | counts
                 lines.append(line | dict(zip(("probability", "low", "high"), improvement(pairs))))
-    return pd.DataFrame(lines, columns=[*PLACE, "steps", "ours", "other", "probability", "low", "high"])
+    found = ("ours", "other", "runs", "places", "probability", "low", "high")
+    return pd.DataFrame(lines, columns=[*PLACE, "steps", *found])
 
 
 def costs(rows: pd.DataFrame, references: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:

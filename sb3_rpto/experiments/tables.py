@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from sb3_rpto.experiments import plots
@@ -248,7 +247,10 @@ def _at_first(table: pd.DataFrame, place: str) -> str:
 def _better(table: pd.DataFrame, our: str, other: str) -> str:
     """At the last evaluation."""
     found = table[(table["ours"] == our) & (table["other"] == other) & (table["steps"] == table["steps"].max())]
-    return _interval(found.iloc[0], "probability", 2, ("low", "high")) if len(found) else "–"
+    if not len(found):
+        return "–"
+    line = found.iloc[0]
+    return f"{line['probability']:.2f}" + ("" if line["runs"] == 2 * line["places"] else _bounds(line, "low", "high"))
 
 
 def _censored(cost: pd.Series) -> str:
@@ -295,15 +297,16 @@ def _scores(lines: pd.DataFrame, keys: Sequence[Any]) -> list[str]:
     return [_interval(lines.loc[key], "score") if key in lines.index else "–" for key in keys]
 
 
-def _interval(line: pd.Series, name: str, digits: int = 2, bounds: tuple[str, str] | None = None) -> str:
-    low, high = bounds or (f"{name}_low", f"{name}_high")
-    values = [float(line[key]) for key in (name, low, high)]
-    if not np.isfinite(values).all():
+def _interval(line: pd.Series, name: str, digits: int = 2) -> str:
+    """A value with its interval; of one run a target without, as that tells nothing of how runs differ."""
+    if not math.isfinite(line[name]):
         return "–"
-    middle, lower, upper = (f"{value:,.{digits}f}" for value in values)
-    # One run a target tells nothing of how runs differ.
-    alone = "runs" in line and line["runs"] == line.get("places", 1)
-    return middle if alone else f"{middle} [{lower}, {upper}]"
+    alone = line["runs"] == line.get("places", 1)
+    return f"{line[name]:,.{digits}f}" + ("" if alone else _bounds(line, f"{name}_low", f"{name}_high", digits))
+
+
+def _bounds(line: pd.Series, low: str, high: str, digits: int = 2) -> str:
+    return f" [{line[low]:,.{digits}f}, {line[high]:,.{digits}f}]"
 
 
 def _grid(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
