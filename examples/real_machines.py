@@ -154,6 +154,7 @@ def main() -> None:
     folder = find_measured()
     if folder is None:
         parser.error("the recordings are not here; set RPTO_MEASURED to their folder (docs/real-machines.md)")
+    commit = provenance.commit()  # before results of this run make the tree another than the commit's
     RESULTS.mkdir(parents=True, exist_ok=True)
     for name in arguments.only or MACHINES:
         errors, found = study(MACHINES[name](folder), arguments.out, arguments.seed)
@@ -163,7 +164,7 @@ def main() -> None:
             writer.writerows(errors)
         manifest = {
             "command": f"python examples/real_machines.py --only {name} --seed {arguments.seed}",
-            "commit": provenance.commit(),
+            "commit": commit,
             "versions": provenance.versions(),
             **provenance.machine(),
             "licence": MACHINES[name](folder).licence,
