@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import sys
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,14 +14,16 @@ from typing import TYPE_CHECKING, Any
 from sb3_rpto.commands import options
 
 if TYPE_CHECKING:
+    import gymnasium as gym
+
     from sb3_rpto.commands.policies import Policy
 
 DESCRIPTION = """\
 Run a policy and print its returns. With --video, draw the source policy in the source,
 the source policy in the target (zero-shot) and the policy in the target side by side.
 
-MODEL is a zip, or the folder of 'sb3-rpto transfer' or 'train', which knows the
-environments and the source agent.
+MODEL is a zip, or the folder of 'sb3-rpto transfer', 'train' or 'adapt', which knows the
+environments and the source agent. After 'adapt' the target is the corrected simulator.
 """
 
 EXAMPLE = """\
@@ -28,6 +31,25 @@ examples:
   sb3-rpto enjoy runs/hopper-rpto --video hopper.mp4
   sb3-rpto enjoy model.zip rpto/Hopper-target0-v0 --source-model source.zip --video hopper.gif
 """
+
+
+@dataclass(frozen=True)
+class Corrected(options.World):
+    """A simulator with what a log showed that it lacks.
+
+    :param folder: of ``adapt``, which left it there
+    """
+
+    folder: Path = field(kw_only=True)
+
+    def make(self, **more: Any) -> gym.Env:
+        """The corrected environment."""
+        from sb3_rpto.effects.carry import read_effects
+        from sb3_rpto.effects.stance import StandingEnv
+
+        env = super().make(**more)
+        base: Any = env.unwrapped
+        return StandingEnv(env, read_effects(self.folder / "effects.json", base.model))
 
 
 def add(commands: Any) -> None:
@@ -61,10 +83,7 @@ def run(parsed: argparse.Namespace) -> int:
     if not parsed.seconds > 0:
         raise ValueError(f"--seconds is {parsed.seconds:g}; give a time above 0")
     model, known = _model(parsed.model)
-    name = parsed.target or known.get("target")
-    if name is None:
-        raise ValueError(f"MODEL {str(parsed.model)!r} is a zip: pass TARGET, the id of the world to run it in")
-    target = options.world(name, "TARGET")
+    target = _target(parsed, known)
     policy = load_policy(model, "MODEL")
     _check_spaces(policy, target, "MODEL", "TARGET")
     shown = _shown(parsed, known, target) if parsed.video is not None else None
@@ -81,8 +100,22 @@ def run(parsed: argparse.Namespace) -> int:
     return 0
 
 
+def _target(parsed: argparse.Namespace, known: dict[str, Any]) -> options.World:
+    """Where the policy is to run: what was asked for, the target of its run, or the simulator that ``adapt`` corrected.
+
+    :raises ValueError: neither is known, or the world cannot be made
+    """
+    name = parsed.target or known.get("target")
+    if name is not None:
+        return options.world(name, "TARGET")
+    if known.get("command") == "adapt":
+        nominal = options.world(known["env"], "MODEL")
+        return Corrected(nominal.name, nominal.env_id, nominal.kwargs, folder=parsed.model)
+    raise ValueError(f"MODEL {str(parsed.model)!r} does not tell its world: pass TARGET, the id of one")
+
+
 def _model(path: Path) -> tuple[Path, dict[str, Any]]:
-    """The zip, and what is known of its run: target, source, source_model."""
+    """The zip, and what is known of its run: command, target, source or env, source_model."""
     if not path.is_dir():
         options.check_file(path, "MODEL")
         return path, {}
@@ -104,7 +137,7 @@ def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: options.Wo
     agent = parsed.source_model or _agent_of(parsed.model, known)
     if agent is None:
         raise ValueError("--video compares with the source policy: pass its zip by --source-model")
-    name = parsed.source or known.get("source") or source_of(target.env_id)
+    name = parsed.source or known.get("source") or known.get("env") or source_of(target.env_id)
     if name is None:
         raise ValueError(f"TARGET {target.name!r} is none of our targets: pass the source's id by --source ID")
     options.check_file(agent, "--source-model")

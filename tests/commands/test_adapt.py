@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ import torch as th
 from stable_baselines3 import SAC
 
 from sb3_rpto import RPTO, cli
+from sb3_rpto.commands import enjoy
 from sb3_rpto.commands.progress import Progress
 from sb3_rpto.effects import LIBRARY
 from sb3_rpto.effects.carry import load_corrected
@@ -69,6 +71,21 @@ def test_a_log_becomes_a_report_a_simulator_and_a_policy(given: Path, tmp_path: 
     assert capsys.readouterr().out == f"adapted already: {tmp_path / 'model.zip'}\n"
     assert adapt(given, tmp_path, "--seed", "1") == 2
     assert "holds a run with seed=0" in capsys.readouterr().err
+
+
+def test_its_folder_is_enjoyed_in_the_corrected_simulator(given: Path, tmp_path: Path, capsys) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copy(given / "agent.zip", run / "model.zip")
+    (run / "config.json").write_text(json.dumps({"command": "adapt", "env": ENV, "source_model": "../agent.zip"}))
+    pull = LIBRARY["torque_offset"]("hinge", offset=5.0)
+    (run / "effects.json").write_text(json.dumps([pull.to_json()]))
+    assert cli.main(["enjoy", str(run), "--episodes", "1", "--seed", "3"]) == 0
+    corrected = capsys.readouterr().out.splitlines()[0]
+    policy, env = SAC.load(given / "agent.zip"), apply_effects(gym.make(ENV), [pull])
+    assert corrected == f"episode 1: return {enjoy._episode(env, policy, 3, deterministic=True):.1f}"
+    assert cli.main(["enjoy", str(run), ENV, "--episodes", "1", "--seed", "3"]) == 0
+    assert capsys.readouterr().out.splitlines()[0] != corrected
 
 
 @pytest.mark.slow
