@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from conftest import SMALL_ENSEMBLE, pendulum
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
@@ -263,6 +264,8 @@ def test_a_source_agent_brings_its_settings_along(zoo, agent, tmp_path):
 def test_another_factor_is_a_target_too(zoo, agent, tmp_path):
     source = ["--source-model", str(agent), "-n", "4", "--eval-freq", "2", "--eval-episodes", "1"]
     run = launch(tmp_path, "rpo", *source, "--eval-env-kwargs", "shift:'limb-x3'", *SMALL, env=SOURCE)
+    saved = yaml.unsafe_load((run / final(run).stem / "args.yml").read_text())  # the zoo's enjoy reads its env_kwargs
+    assert (saved["env_kwargs"], saved["source_env_kwargs"]) == ({"shift": "limb-x3"}, None)
     assert RPO.load(final(run), device="cpu").num_timesteps == 4
 
 

@@ -57,6 +57,7 @@ def run(parsed: argparse.Namespace) -> int:
     from sb3_rpto.commands.runs import RunFolder, beside, load_checkpoint
     from sb3_rpto.commands.terminal import lines, say
     from sb3_rpto.effects import Declared
+    from sb3_rpto.experiments.sources import digest
     from sb3_rpto.files import write_atomically
     from sb3_rpto.tracing import figures
 
@@ -85,10 +86,13 @@ def run(parsed: argparse.Namespace) -> int:
         "command": "adapt",
         "env": world.name,
         "source_model": beside(parsed.out, parsed.source_model),
+        "source_model_sha256": digest(parsed.source_model),
         "files": [beside(parsed.out, file) for file in parsed.files],
+        "recordings_sha256": recordings.digest(data),
         "declare": parsed.declare,
         "candidates": parsed.candidates,
         "known": None if parsed.known is None else beside(parsed.out, parsed.known),
+        "known_sha256": None if parsed.known is None else digest(parsed.known),
         "steps": parsed.steps,
         "seed": parsed.seed,
         "settings": dict(parsed.set),

@@ -64,7 +64,9 @@ def add(commands: Any) -> None:
     parser.add_argument("model", metavar="MODEL", type=Path, help="zip of a model, or a run's folder")
     parser.add_argument("target", metavar="TARGET", nargs="?", help="id of the world to run in (default: the run's)")
     parser.add_argument("--episodes", metavar="N", type=int, default=10, help="(default: 10)")
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the initial states (default: 0)")
+    parser.add_argument(
+        "--seed", metavar="N", type=int, default=0, help="of the initial states and drawn actions (default: 0)"
+    )
     parser.add_argument("--stochastic", action="store_true", help="draw actions as in training")
     parser.add_argument("--video", metavar="FILE", type=Path, help="write a film: .mp4 or .gif")
     parser.add_argument("--seconds", metavar="S", type=float, default=10.0, help="of the film at most (default: 10)")
@@ -76,11 +78,12 @@ def add(commands: Any) -> None:
 def run(parsed: argparse.Namespace) -> int:
     """Evaluate, then film."""
     import numpy as np
+    from stable_baselines3.common.utils import set_random_seed
 
     from sb3_rpto.commands.policies import load_policy
 
     options.check_positive(parsed, "episodes")
-    if not parsed.seconds > 0:
+    if not 0 < parsed.seconds < float("inf"):
         raise ValueError(f"--seconds is {parsed.seconds:g}; give a time above 0")
     model, known = _model(parsed.model)
     target = _target(parsed, known)
@@ -89,6 +92,7 @@ def run(parsed: argparse.Namespace) -> int:
     shown = _shown(parsed, known, target) if parsed.video is not None else None
 
     env = target.make()
+    set_random_seed(parsed.seed)  # of the actions of --stochastic
     returns = []
     for episode in range(parsed.episodes):
         returns.append(_episode(env, policy, parsed.seed if episode == 0 else None, not parsed.stochastic))
@@ -146,7 +150,12 @@ def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: options.Wo
     _check_spaces(policy, source, "--source-model", "--source")
     trial = target.make(render_mode="rgb_array")
     trial.reset(seed=0)
-    trial.render()
+    try:
+        trial.render()
+    except Exception as error:  # of whatever draws: MuJoCo's FatalError, OpenGL's, glfw's
+        raise ValueError(
+            f"--video: {target.name} cannot be drawn ({error}); unset DISPLAY, or set MUJOCO_GL=egl"
+        ) from error
     trial.close()
     return policy, source
 
@@ -155,13 +164,18 @@ def _agent_of(folder: Path, known: dict[str, Any]) -> str | None:
     """The source agent of a run, whose path is kept relative to its folder.
 
     :raises FileNotFoundError: it is there no longer
+    :raises ValueError: another is in its place
     """
+    from sb3_rpto.experiments.sources import digest
+
     agent = known.get("source_model")
     if agent is None:
         return None
     found = [path for path in (folder / agent, Path(agent)) if path.is_file()]
     if not found:
         raise FileNotFoundError(f"the run's source agent {agent!r} is not there; pass its zip by --source-model")
+    if known.get("source_model_sha256") not in (None, digest(found[0])):
+        raise ValueError(f"{found[0]} is another agent than the run began with; pass that one's zip by --source-model")
     return str(found[0])
 
 
@@ -192,13 +206,16 @@ def _episode(env: Any, policy: Policy, seed: int | None, deterministic: bool) ->
 def _film(
     parsed: argparse.Namespace, policy: Policy, target: options.World, source_policy: Policy, source: options.World
 ) -> None:
+    from stable_baselines3.common.utils import set_random_seed
+
     from sb3_rpto.commands.video import Panel, film
 
     in_source, in_target = (partial(world.make, render_mode="rgb_array") for world in (source, target))
     panels = [
-        Panel("source policy in the source", source_policy, in_source),
-        Panel("source policy in the target (zero-shot)", source_policy, in_target),
-        Panel("transferred policy in the target", policy, in_target),
+        Panel("source policy in the source", source_policy, in_source, not parsed.stochastic),
+        Panel("source policy in the target (zero-shot)", source_policy, in_target, not parsed.stochastic),
+        Panel("transferred policy in the target", policy, in_target, not parsed.stochastic),
     ]
+    set_random_seed(parsed.seed)
     film(panels, parsed.video, parsed.seconds, parsed.seed)
     print(f"written: {parsed.video}")

@@ -128,9 +128,12 @@ def _result(file: Path) -> list[dict[str, Any]] | None:
         of_run["settings"] = _chosen(content.get("config", {}))
         if content.get("error"):
             print(f"sb3-rpto: left out, failed: {file}", file=sys.stderr)
+        of_run["run"] = str(file)
         of_run["agent"] = str(content.get("config", {}).get("source_model_sha256"))[:8]
         return [{**of_run, "steps": row["steps"], "return": row["return"]} for row in content["rows"]]
     except (ValueError, KeyError, TypeError, AttributeError):
+        if file.name == "result.json":
+            print(f"sb3-rpto: left out, no result of ours or torn: {file}", file=sys.stderr)
         return None
 
 
@@ -145,14 +148,14 @@ def draw(axes: Any, rows: pd.DataFrame, title: str) -> None:
     """One panel.
 
     :param axes: of matplotlib
-    :param rows: columns method, seed, steps, return
+    :param rows: columns method, run, seed, steps, return
     :param title: of the panel
     """
     from sb3_rpto.experiments.report import summarise
 
-    for method, lines in summarise(rows, ["method", "steps"]).groupby("method", sort=True):
-        seeds = lines["seeds"].max()
-        lines = lines[lines["seeds"] == seeds]  # where some were not evaluated, the others would draw a jump
+    for method, own in rows.groupby("method", sort=True):
+        lines = summarise(_at_same_steps(own), ["steps"])
+        seeds = own["seed"].nunique()
         label = f"{method} ({seeds})"
         if len(lines) == 1:  # zero-shot
             axes.axhline(lines["iqm"].iloc[0], color="grey", linestyle="--", label=label)
@@ -163,3 +166,24 @@ def draw(axes: Any, rows: pd.DataFrame, title: str) -> None:
     axes.set(title=title, xlabel="steps", ylabel="return")
     axes.grid(alpha=0.3)
     axes.legend(title="method (seeds)", fontsize="small")
+
+
+def _at_same_steps(rows: pd.DataFrame) -> pd.DataFrame:
+    """Runs at all steps at which one of them was evaluated, on a straight line between evaluations of their own.
+
+    Where a run has ended, the others would draw a jump: there the line ends.
+    """
+    import numpy as np
+    import pandas as pd
+
+    runs = [run.sort_values("steps") for _, run in rows.groupby("run")]
+    first, last = (choose(run["steps"].iloc[at] for run in runs) for choose, at in ((max, 0), (min, -1)))
+    steps = np.array(sorted({step for step in rows["steps"] if first <= step <= last}))
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {"seed": run["seed"].iloc[0], "steps": steps, "return": np.interp(steps, run["steps"], run["return"])}
+            )
+            for run in runs
+        ]
+    )

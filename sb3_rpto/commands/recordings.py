@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -101,6 +102,16 @@ def read(files: Sequence[str], form: str | None) -> Measurements:
     if len(found) > 1:
         raise ValueError(f"FILES are of several formats ({', '.join(sorted(map(str, found)))}); convert them to one")
     return getattr(Measurements, FORMATS[str(found.pop())])(files)
+
+
+def digest(data: Measurements) -> str:
+    """SHA-256 of what was recorded, whatever files hold it."""
+    found = hashlib.sha256()
+    for episode in data.episodes:
+        found.update(f"{episode.run} {episode.part} {dict(episode.params)}".encode())
+        for values in (episode.time, episode.qpos, episode.qvel, episode.ctrl, episode.qfrc, episode.enabled):
+            found.update(values.tobytes())
+    return found.hexdigest()
 
 
 def _format_of(file: str) -> str:

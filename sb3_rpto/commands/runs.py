@@ -48,24 +48,42 @@ class RunFolder:
         """Configuration and learning curve."""
         return self.path / "result.json"
 
+    @property
+    def config(self) -> Path:
+        """What was asked."""
+        return self.path / "config.json"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.path / "checkpoints"
+
+    def begun(self) -> dict[str, Any] | None:
+        """What was asked of the run that the folder holds; None where it holds none of ours."""
+        try:
+            found = json.loads(self.config.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        return found if isinstance(found, dict) and "command" in found else None
+
     @classmethod
     def open(cls, path: Path, config: dict[str, Any]) -> RunFolder:
         """Begin a run, or go on with it.
 
         :param path: of the folder; it is made where it is not there
         :param config: all that decides the outcome, as JSON has it
-        :raises ValueError: when the folder holds a run of another configuration
+        :raises ValueError: when the folder holds a run of another configuration, or what no run of ours wrote
         """
         run, asked = cls(path), plain(config)
         path.mkdir(parents=True, exist_ok=True)
-        file = path / "config.json"
-        if not run.result.exists() and run.newest_checkpoint() is None:
-            for kept in () if file.exists() else (run.model, run.replay_buffer):
+        begun = run.begun()
+        if begun is None:
+            for kept in (run.config, run.model, run.replay_buffer, run.result, run.checkpoints):
                 if kept.exists():
                     raise ValueError(f"--out {path} holds a {kept.name} that no run of ours wrote; give another folder")
-            write_json(file, asked)
+        if begun is None or (not run.result.exists() and run.newest_checkpoint() is None):
+            write_json(run.config, asked)
             return run
-        begun = json.loads(file.read_text(encoding="utf-8"))
         names = {*begun, *asked}
         changed = sorted(n for n in names if begun.get(n) != asked.get(n) and not _same_file(path, begun, asked, n))
         if changed:
@@ -81,10 +99,10 @@ class RunFolder:
 
         :param rows: the learning curve
         """
-        config = json.loads((self.path / "config.json").read_text(encoding="utf-8"))
+        config = json.loads(self.config.read_text(encoding="utf-8"))
         versions = {package: version(package) for package in PACKAGES}
         write_json(self.result, {"config": config, "versions": versions, "rows": rows})
-        shutil.rmtree(self.path / "checkpoints", ignore_errors=True)
+        shutil.rmtree(self.checkpoints, ignore_errors=True)
 
     def save_checkpoint(self, steps: int, write: Callable[[Path], None]) -> None:
         """Replace the checkpoint by a new one, as a whole: its folder gets its name when all files are in it.
@@ -92,7 +110,7 @@ class RunFolder:
         :param steps: taken so far
         :param write: writes its files into the folder that it is given
         """
-        folder = self.path / "checkpoints"
+        folder = self.checkpoints
         unfinished = folder / f".{steps:010d}.{os.getpid()}"
         shutil.rmtree(unfinished, ignore_errors=True)  # of a killed run: in a container all have the same number
         unfinished.mkdir(parents=True)
@@ -104,7 +122,7 @@ class RunFolder:
 
     def newest_checkpoint(self) -> Path | None:
         """The folder of the last whole checkpoint."""
-        found = sorted(path for path in (self.path / "checkpoints").glob("[0-9]*"))
+        found = sorted(path for path in self.checkpoints.glob("[0-9]*"))
         return found[-1] if found else None
 
 

@@ -96,6 +96,7 @@ def run(parsed: argparse.Namespace) -> int:
         "source_model": beside(parsed.out, parsed.source_model),
         "source_model_sha256": digest(parsed.source_model),
         "source_data": beside(parsed.out, parsed.source_data),
+        "source_data_sha256": None if parsed.source_data is None else digest(parsed.source_data),
         "every": every,
         "episodes": parsed.episodes,
     }

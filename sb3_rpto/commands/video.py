@@ -26,13 +26,15 @@ class Panel:
     """A policy in a world.
 
     :param title: what the film calls it
-    :param policy: that acts, deterministically
+    :param policy: that acts
     :param make_env: makes the world, which draws ``rgb_array``
+    :param deterministic: whether it acts by its mean
     """
 
     title: str
     policy: Policy
     make_env: Callable[[], gym.Env]
+    deterministic: bool = True
 
 
 def require(path: Path) -> None:
@@ -103,6 +105,7 @@ class _Scene:
         self.panel = panel
         self.env = panel.make_env()
         self.observation, _ = self.env.reset(seed=seed)
+        self.memory: Any = None  # of a recurrent policy
         self.total, self.steps, self.over = 0.0, 0, False
 
     @property
@@ -116,7 +119,9 @@ class _Scene:
         for _ in range(n_steps):
             if self.over:
                 return
-            action, _ = self.panel.policy.predict(self.observation, deterministic=True)
+            action, self.memory = self.panel.policy.predict(
+                self.observation, self.memory, deterministic=self.panel.deterministic
+            )
             self.observation, reward, terminated, truncated, _ = self.env.step(action)
             self.total += float(reward)
             self.steps += 1

@@ -205,9 +205,15 @@ class TransferManager(ExperimentManager):
         return env
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
-        """As the zoo's, from which ``enjoy`` reads whether the agent's observations are normalised."""
+        """As the zoo's, whose ``enjoy`` reads there whether observations are normalised, and how to make the target.
+
+        It makes it by ``env_kwargs``: those of the source are kept as ``source_env_kwargs``.
+        """
         if self.normalize:
             saved_hyperparams.setdefault("normalize", self.normalize_kwargs or True)
+        if self.start is not None:
+            of_source = vars(self.args).get("env_kwargs")
+            vars(self.args).update(source_env_kwargs=of_source, env_kwargs=self._eval_env_kwargs_args or of_source)
         super()._save_config(saved_hyperparams)
 
     # ------------------------------------------------------------------ models

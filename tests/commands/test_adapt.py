@@ -71,6 +71,12 @@ def test_a_log_becomes_a_report_a_simulator_and_a_policy(given: Path, tmp_path: 
     assert capsys.readouterr().out == f"adapted already: {tmp_path / 'model.zip'}\n"
     assert adapt(given, tmp_path, "--seed", "1") == 2
     assert "holds a run with seed=0" in capsys.readouterr().err
+    log = given / "log.csv"
+    kept = log.read_text()
+    log.write_text(kept.replace("0.005,", "0.006,", 1))
+    assert adapt(given, tmp_path) == 2
+    assert "holds a run with recordings_sha256=" in capsys.readouterr().err
+    log.write_text(kept)
 
 
 def test_its_folder_is_enjoyed_in_the_corrected_simulator(given: Path, tmp_path: Path, capsys) -> None:

@@ -181,7 +181,7 @@ def test_the_budget_is_that_of_the_task(agent: Path, tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_is_replaced_as_a_whole(tmp_path: Path) -> None:
-    run = RunFolder.open(tmp_path, {"a": 1})
+    run = RunFolder.open(tmp_path, {"command": "train", "a": 1})
     run.save_checkpoint(1, lambda folder: (folder / "model.zip").write_text("first") and None)
 
     def killed(folder: Path) -> None:
@@ -194,7 +194,7 @@ def test_a_checkpoint_is_replaced_as_a_whole(tmp_path: Path) -> None:
     run.save_checkpoint(3, lambda folder: (folder / "model.zip").write_text("third") and None)
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["0000000003"]
     with pytest.raises(ValueError, match="a=1, not 2"):
-        RunFolder.open(tmp_path, {"a": 2})
+        RunFolder.open(tmp_path, {"command": "train", "a": 2})
 
 
 # ---------------------------------------------------------------------- plot
@@ -424,10 +424,60 @@ def test_plot_tells_source_agents_apart_where_seeds_do_not(tmp_path: Path) -> No
 
 def test_a_line_is_of_the_same_runs_from_end_to_end() -> None:
     matplotlib = pytest.importorskip("matplotlib.figure", reason="the extra 'experiments' is not installed")
-    rows = pd.DataFrame([("rpto", seed, steps, 1.0) for seed in (0, 1) for steps in (0, 200 + 100 * seed, 600)])
+    evaluated = {0: (0, 200, 600), 1: (0, 300, 600, 700)}
+    rows = pd.DataFrame([("rpto", seed, seed, s, 1.0 * s + seed) for seed, steps in evaluated.items() for s in steps])
     axes = matplotlib.Figure().subplots()
-    draw(axes, rows.set_axis(["method", "seed", "steps", "return"], axis=1), "")
-    assert axes.lines[0].get_xdata().tolist() == [0, 600]
+    draw(axes, rows.set_axis(["method", "run", "seed", "steps", "return"], axis=1), "")
+    assert axes.lines[0].get_xdata().tolist() == [0, 200, 300, 600]
+    assert axes.lines[0].get_ydata().tolist() == [0.5, 200.5, 300.5, 600.5]
+
+
+def test_runs_that_share_their_beginning_alone_are_a_line() -> None:
+    matplotlib = pytest.importorskip("matplotlib.figure", reason="the extra 'experiments' is not installed")
+    rows = pd.DataFrame([("sac", seed, seed, s, 1.0 * s) for seed, s in ((0, 0), (0, 100), (1, 0), (1, 30), (1, 90))])
+    axes = matplotlib.Figure().subplots()
+    draw(axes, rows.set_axis(["method", "run", "seed", "steps", "return"], axis=1), "")
+    assert axes.lines[0].get_xdata().tolist() == [0, 30, 90]
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.zip", "replay_buffer.pkl", "result.json", "checkpoints"])
+def test_nothing_of_others_is_overwritten(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    theirs = tmp_path / name / "best.pt" if name == "checkpoints" else tmp_path / name
+    theirs.parent.mkdir(exist_ok=True)
+    theirs.write_text('{"model_type": "bert"}')
+    assert train(tmp_path) == 2
+    assert f"holds a {name} that no run of ours wrote" in error(capsys)
+    assert theirs.read_text() == '{"model_type": "bert"}'
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+class Remembers:
+    """Acts by how often it was asked in this episode."""
+
+    def predict(self, observation: object, state: object = None, deterministic: bool = False) -> tuple:
+        count = int(state or 0) + 1
+        return np.array([count / 10], dtype=np.float32), count
+
+
+def test_a_film_plays_recurrent_policies_with_their_memory() -> None:
+    acted = []
+
+    class Watched(gym.Wrapper):
+        def step(self, action: np.ndarray) -> tuple:
+            acted.append(round(float(action[0]), 1))
+            return super().step(action)
+
+    scene = video._Scene(video.Panel("", Remembers(), lambda: Watched(gym.make("Pendulum-v1"))), seed=0)
+    scene.advance(3)
+    assert acted == [0.1, 0.2, 0.3]
+
+
+def test_drawn_actions_follow_the_seed(agent: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = []
+    for seed in ("3", "3", "4"):
+        assert cli.main(["enjoy", str(agent), "--stochastic", "--episodes", "2", "--seed", seed]) == 0
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1] != said[2]
 
 
 def test_plot_counts_seeds_and_tells_settings_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
