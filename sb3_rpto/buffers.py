@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pathlib
+import pickle
 from functools import partial
 from typing import Any, Literal
 
@@ -259,7 +260,7 @@ def load_transitions(
     if isinstance(data, str | pathlib.Path) and str(data).endswith(".npz"):
         arrays = _load_npz(data, rewards_optional)
     else:
-        buffer = data if isinstance(data, ReplayBuffer) else load_from_pkl(data)
+        buffer = data if isinstance(data, ReplayBuffer) else _unpickled(data)
         if not isinstance(buffer, ReplayBuffer):
             raise ValueError(f"expected an SB3 ReplayBuffer, its pickle or an .npz file, got {type(buffer).__name__}")
         if isinstance(buffer, DictReplayBuffer):
@@ -274,6 +275,19 @@ def load_transitions(
         if not np.isfinite(array).all():
             raise ValueError(f"{name} of the loaded transitions hold NaN or infinite values; remove those rows")
     return arrays
+
+
+def _unpickled(file: str | pathlib.Path | io.BufferedIOBase) -> Any:
+    """What a pickle holds.
+
+    :raises ValueError: it is none, or torn
+    """
+    try:
+        return load_from_pkl(file)
+    except (pickle.UnpicklingError, EOFError, IndexError, KeyError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"{str(file)!r} is no pickle ({error}); give what save_replay_buffer() wrote, or an .npz file"
+        ) from error
 
 
 def _load_npz(path: str | pathlib.Path, rewards_optional: bool) -> dict[str, np.ndarray]:

@@ -63,6 +63,7 @@ def run(parsed: argparse.Namespace) -> int:
 
     figures.require()
     options.check_positive(parsed, "steps")
+    options.check_seed(parsed.seed)
     options.check_file(parsed.source_model, "ZIP")
     recordings.check_candidates(parsed.candidates)
     settings = dict(parsed.set)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from dataclasses import dataclass, field
@@ -80,14 +79,18 @@ def run(parsed: argparse.Namespace) -> int:
     import numpy as np
     from stable_baselines3.common.utils import set_random_seed
 
-    from sb3_rpto.commands.policies import load_policy
+    from sb3_rpto.commands.policies import load_policy, statistics_of
 
     options.check_positive(parsed, "episodes")
+    options.check_seed(parsed.seed)
     if not 0 < parsed.seconds < float("inf"):
         raise ValueError(f"--seconds is {parsed.seconds:g}; give a time above 0")
     model, known = _model(parsed.model)
     target = _target(parsed, known)
     policy = load_policy(model, "MODEL")
+    statistics = statistics_of(model)
+    if statistics is not None:
+        print(f"sb3-rpto: MODEL saw observations normalised by {statistics}, here it sees them raw", file=sys.stderr)
     _check_spaces(policy, target, "MODEL", "TARGET")
     shown = _shown(parsed, known, target) if parsed.video is not None else None
 
@@ -120,12 +123,15 @@ def _target(parsed: argparse.Namespace, known: dict[str, Any]) -> options.World:
 
 def _model(path: Path) -> tuple[Path, dict[str, Any]]:
     """The zip, and what is known of its run: command, target, source or env, source_model."""
+    from sb3_rpto.commands.runs import RunFolder
+
     if not path.is_dir():
         options.check_file(path, "MODEL")
         return path, {}
+    known = RunFolder(path).begun() or {}
+    if known and not (path / "model.zip").is_file():
+        raise FileNotFoundError(f"MODEL {path}: its run is not finished; repeat the command that began it to go on")
     options.check_file(path / "model.zip", "MODEL")
-    config = path / "config.json"
-    known = json.loads(config.read_text(encoding="utf-8")) if config.is_file() else {}
     return path / "model.zip", {name: value for name, value in known.items() if value is not None}
 
 

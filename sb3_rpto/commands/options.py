@@ -99,6 +99,15 @@ def _read(parsed: Any) -> Any:
     return parsed
 
 
+def check_seed(seed: int) -> None:
+    """Refuse a seed that NumPy's generators would not take.
+
+    :raises ValueError: with the range
+    """
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"--seed is {seed}; give a number from 0 to {2**32 - 1:,}")
+
+
 def check_positive(parsed: argparse.Namespace, *names: str) -> None:
     """Refuse numbers below 1; None stands for a default.
 

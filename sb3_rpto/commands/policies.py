@@ -53,3 +53,15 @@ def load_policy(path: str | Path, argument: str) -> Policy:
     policy.load_state_dict(parameters["policy"])
     policy.set_training_mode(False)
     return policy
+
+
+def statistics_of(path: str | Path) -> Path | None:
+    """The statistics of VecNormalize that the zoo or SB3's callbacks left with a zip; None where there are none.
+
+    :param path: of the zip
+    """
+    path = Path(path)
+    steps = path.stem.removeprefix("rl_model_")
+    zoo = (file for file in path.parent.glob("*/vecnormalize.pkl") if file.with_name("args.yml").is_file())
+    found = (path.with_name("vecnormalize.pkl"), path.with_name(f"rl_model_vecnormalize_{steps}.pkl"), *zoo)
+    return next((file for file in found if file.is_file()), None)

@@ -50,6 +50,7 @@ def run(parsed: argparse.Namespace) -> int:
     from sb3_rpto.zoo.settings import shipped_settings
 
     options.check_positive(parsed, "steps", "every", "episodes")
+    options.check_seed(parsed.seed)
     task = options.world(parsed.task, "TASK")
     settings = {**shipped_settings("sac", task.env_id), **dict(parsed.set)}
     steps = int(settings.pop("n_timesteps") if parsed.steps is None else parsed.steps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from functools import partial
 from pathlib import Path
@@ -35,6 +36,8 @@ BESIDE_SAC = {
     "sac-warm-high": {"n_critics"},
     "sysid-retrain": {"declared", "retrain_steps", "max_steps", "dynamics_kwargs"},
 }
+#: SAC in the target.
+OF_SAC = ("sac", "sac-warm", "sac-warm-high", "sac-mixed", "oracle")
 #: Methods that begin anew: nothing is learned step by step, or in two parts.
 NOT_RESUMABLE = ("zero-shot", "sysid-retrain")
 
@@ -72,6 +75,7 @@ def run(parsed: argparse.Namespace) -> int:
     from sb3_rpto.zoo.settings import ALGORITHMS, shipped_settings
 
     options.check_positive(parsed, "steps", "every", "episodes")
+    options.check_seed(parsed.seed)
     if parsed.method not in REGISTRY:
         raise ValueError(f"--method {parsed.method!r} does not exist; choose one of {', '.join(REGISTRY)}")
     options.check_file(parsed.source_model, "ZIP")
@@ -81,9 +85,10 @@ def run(parsed: argparse.Namespace) -> int:
     settings = dict(parsed.set)
     if parsed.source_data is not None and not REGISTRY[parsed.method].takes_source_data:
         print(f"sb3-rpto: --method {parsed.method} has no use for --source-data", file=sys.stderr)
-    _check(parsed.method, settings, parsed.source_model, target)
     budget = shipped_settings(parsed.method if parsed.method in ALGORITHMS else "rpto", target.env_id)["n_timesteps"]
     steps = parsed.steps or budget
+    _check_settings(parsed.method, settings, steps)
+    _check_worlds(parsed, source, target)
     every = parsed.every or max(steps // 10, 1)
     config = {
         "command": "transfer",
@@ -157,22 +162,67 @@ def _source(parsed: argparse.Namespace, target: options.World) -> options.World:
     return source
 
 
-def _check(method: str, settings: dict[str, Any], source_model: str, target: options.World) -> None:
-    """Refuse what would fail later: a zip of another task, settings that the method does not know.
+def _check_settings(method: str, settings: dict[str, Any], steps: int) -> None:
+    """Refuse settings that the method does not know, or that its budget does not bear.
+
+    :raises ValueError: naming the argument
+    """
+    options.check_names(settings, _known_settings(method))
+    if method == "sysid-retrain" and not settings.get("declared"):
+        raise ValueError("--method sysid-retrain needs --set 'declared=[...]', the simulator's numbers to identify")
+    if method not in OF_SAC:
+        return
+    options.check_sac({name: value for name, value in settings.items() if name not in BESIDE_SAC.get(method, set())})
+    if settings.get("train_freq", 1) != 1:
+        raise ValueError(
+            f"--set train_freq is {settings['train_freq']!r}, and a budget of target steps is met step by step: give 1 "
+            "and gradient_steps for the number of updates"
+        )
+    if method == "sac" and settings.get("learning_starts", 100) >= steps:
+        raise ValueError(
+            f"--steps {steps} ends before the first update (learning_starts={settings.get('learning_starts', 100)}): "
+            "nothing would be learned; give more steps, or --set learning_starts=10"
+        )
+    if method != "sac" and "learning_starts" in settings:
+        raise ValueError(f"--set learning_starts: --method {method} takes no random steps; leave it out")
+
+
+def _check_worlds(parsed: argparse.Namespace, source: options.World, target: options.World) -> None:
+    """Refuse what would fail later: an agent, a source or transitions of another task.
 
     :raises ValueError: naming the argument
     """
     from sb3_rpto.algorithms.warm import load_sac
+    from sb3_rpto.buffers import load_transitions
+    from sb3_rpto.commands.policies import statistics_of
+    from sb3_rpto.experiments.methods import REGISTRY
 
-    options.check_names(settings, _known_settings(method))
-    if method == "sysid-retrain" and not settings.get("declared"):
-        raise ValueError("--method sysid-retrain needs --set 'declared=[...]', the simulator's numbers to identify")
-    sac, env = load_sac(source_model, "cpu"), target.make()
-    for name in ("observation_space", "action_space"):
-        of_agent, of_target = getattr(sac, name), getattr(env, name)
-        if of_agent.shape != of_target.shape:
-            raise ValueError(f"ZIP {source_model!r} has {name} {of_agent}, TARGET {of_target}; name its task's agent")
-    env.close()
+    statistics = statistics_of(parsed.source_model)
+    if statistics is not None:
+        raise ValueError(
+            f"ZIP {parsed.source_model!r} saw observations normalised by {statistics}, which this command cannot: use "
+            "python -m sb3_rpto.zoo.train, or VecNormalize in Python"
+        )
+    sac = load_sac(parsed.source_model, "cpu")
+    for argument, world in (("TARGET", target), ("--source", source)):
+        env = world.make()
+        for name in ("observation_space", "action_space"):
+            of_agent, of_world = getattr(sac, name), getattr(env, name)
+            if of_agent.shape != of_world.shape:
+                raise ValueError(
+                    f"ZIP {parsed.source_model!r} has {name} {of_agent}, {argument} {of_world}; name its task's agent"
+                )
+        env.close()
+    if parsed.source_data is None or not REGISTRY[parsed.method].takes_source_data:
+        return
+    try:
+        data = load_transitions(parsed.source_data)
+    except ValueError as error:
+        raise ValueError(f"--source-data: {error}") from error
+    for name, space in (("observations", sac.observation_space), ("actions", sac.action_space)):
+        found, expected = data[name][0].size, math.prod(space.shape or ())
+        if found != expected:
+            raise ValueError(f"--source-data holds {name} of {found} numbers, the agent's have {expected}")
 
 
 def _known_settings(method: str) -> set[str]:

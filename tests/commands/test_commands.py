@@ -308,6 +308,12 @@ BAD = {
     "transfer A/model.zip T --out O --set weighting=papre": "weighting='papre'",
     "transfer A/model.zip T --out O --method sac-warm --set gama=1": "did you mean 'gamma'",
     "transfer A/model.zip T --out O --method sysid-retrain": "--set 'declared=[...]'",
+    "transfer A/model.zip T --out O --method sac --set train_freq=4": "is met step by step",
+    "transfer A/model.zip T --out O --method sac --steps 90": "ends before the first update (learning_starts=100)",
+    "transfer A/model.zip T --out O --method sac-warm --set learning_starts=9": "sac-warm takes no random steps",
+    "transfer A/model.zip T --out O --method sac-mixed --set batch_size=0": "batch_size must be a positive integer",
+    "transfer A/model.zip T --out O --method sac-mixed --source-data A/model.zip": "model.zip' is no pickle",
+    "transfer A/model.zip T --out O --source rpto/InvertedDoublePendulum-v0": "--source Box",
     "plot absent.json --out f.png": "there is nothing at 'absent.json'",
     "plot A/config.json --out f.png": "is no result file",
     "plot A --out f.txt": "a figure is .png",
@@ -317,6 +323,10 @@ BAD = {
     "enjoy A rpto/InvertedDoublePendulum-v0": "name the same task",
     "enjoy A --episodes 0": "--episodes is 0",
     "enjoy A --seconds 0": "--seconds is 0",
+    "enjoy A --seconds inf": "--seconds is inf",
+    "enjoy A --seed -1": "--seed is -1",
+    "enjoy BEGUN": "its run is not finished",
+    "train ContinuousCartPole --out O --seed -1": "--seed is -1",
     "enjoy A --video f.avi": "a film is .mp4 or .gif",
     "enjoy A --video f.gif": "--source-model",
 }
@@ -327,8 +337,15 @@ BAD = {
 def test_wrong_input_is_one_line_before_the_work(
     command: str, agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    names = {"O": str(tmp_path / "out"), "T": TARGET, "FOREIGN": str(tmp_path / "foreign")}
-    (tmp_path / "foreign").mkdir()
+    names = {
+        "O": str(tmp_path / "out"),
+        "T": TARGET,
+        "FOREIGN": str(tmp_path / "foreign"),
+        "BEGUN": str(tmp_path / "begun"),
+    }
+    for name in ("foreign", "begun"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "begun" / "config.json").write_text('{"command": "train"}')
     (tmp_path / "foreign" / "model.zip").write_text("somebody's")
     given = [names.get(word, str(agent) + word[1:] if word.split("/")[0] == "A" else word) for word in command.split()]
     assert cli.main(given) == 2
@@ -470,6 +487,22 @@ def test_a_film_plays_recurrent_policies_with_their_memory() -> None:
     scene = video._Scene(video.Panel("", Remembers(), lambda: Watched(gym.make("Pendulum-v1"))), seed=0)
     scene.advance(3)
     assert acted == [0.1, 0.2, 0.3]
+
+
+@pytest.mark.parametrize("zoo", [False, True])
+def test_normalised_observations_are_told(
+    zoo: bool, agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(agent / "model.zip", tmp_path / "Some-v0.zip")
+    folder = tmp_path / "Some-v0" if zoo else tmp_path
+    folder.mkdir(exist_ok=True)
+    for name in ("vecnormalize.pkl", "args.yml"):
+        (folder / name).write_text("")
+    given = ["transfer", str(tmp_path / "Some-v0.zip"), TARGET, "--method", "rpo", "--out", str(tmp_path / "out")]
+    assert cli.main(given) == 2
+    assert f"normalised by {folder / 'vecnormalize.pkl'}" in error(capsys)
+    assert cli.main(["enjoy", str(tmp_path / "Some-v0.zip"), TARGET, "--episodes", "1"]) == 0
+    assert f"normalised by {folder / 'vecnormalize.pkl'}" in capsys.readouterr().err
 
 
 def test_drawn_actions_follow_the_seed(agent: Path, capsys: pytest.CaptureFixture[str]) -> None:
