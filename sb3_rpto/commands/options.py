@@ -164,6 +164,19 @@ def check_sac(settings: dict[str, Any]) -> None:
             raise ValueError(f"--set {name}: it takes an object of Python; use the Python interface")
 
 
+def check_learns(settings: dict[str, Any], steps: int) -> None:
+    """Refuse a training of SAC's that ends before its first update.
+
+    :raises ValueError: naming the options
+    """
+    first = settings.get("learning_starts", 100)
+    if first >= steps:
+        raise ValueError(
+            f"--steps {steps} ends before the first update (learning_starts={first}): nothing would be learned; give "
+            "more steps, or a smaller --set learning_starts"
+        )
+
+
 @dataclass(frozen=True)
 class World:
     """An environment by the name that the user gave it.

@@ -57,12 +57,7 @@ def run(parsed: argparse.Namespace) -> int:
     settings.pop("n_timesteps", None)
     options.check_names(settings, constructor_names(SAC) - {"env", "seed", "device"})
     options.check_sac(settings)
-    first = settings.get("learning_starts", 100)
-    if first >= steps:
-        raise ValueError(
-            f"--steps {steps} ends before the first update (learning_starts={first}): nothing would be learned; give "
-            "more steps, or --set learning_starts=100"
-        )
+    options.check_learns(settings, steps)
     env = task.make()
     check_spaces(env.observation_space, env.action_space)
     settings.setdefault("buffer_size", min(1_000_000, steps))  # SAC's, but no larger a file than there is to keep

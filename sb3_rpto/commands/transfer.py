@@ -167,23 +167,18 @@ def _check_settings(method: str, settings: dict[str, Any], steps: int) -> None:
 
     :raises ValueError: naming the argument
     """
+    from sb3_rpto.experiments.baselines import check_step_by_step
+
     options.check_names(settings, _known_settings(method))
     if method == "sysid-retrain" and not settings.get("declared"):
         raise ValueError("--method sysid-retrain needs --set 'declared=[...]', the simulator's numbers to identify")
     if method not in OF_SAC:
         return
     options.check_sac({name: value for name, value in settings.items() if name not in BESIDE_SAC.get(method, set())})
-    if settings.get("train_freq", 1) != 1:
-        raise ValueError(
-            f"--set train_freq is {settings['train_freq']!r}, and a budget of target steps is met step by step: give 1 "
-            "and gradient_steps for the number of updates"
-        )
-    if method == "sac" and settings.get("learning_starts", 100) >= steps:
-        raise ValueError(
-            f"--steps {steps} ends before the first update (learning_starts={settings.get('learning_starts', 100)}): "
-            "nothing would be learned; give more steps, or --set learning_starts=10"
-        )
-    if method != "sac" and "learning_starts" in settings:
+    check_step_by_step(settings)
+    if method == "sac":
+        options.check_learns(settings, steps)
+    elif "learning_starts" in settings:
         raise ValueError(f"--set learning_starts: --method {method} takes no random steps; leave it out")
 
 

@@ -43,7 +43,7 @@ def fine_tuned_sac(
     :param settings: attributes to change, e.g. ``gradient_steps``
     :raises ValueError: for another ``train_freq``, or an ``ent_coef`` that is fixed where the source's is learned
     """
-    _check_step_by_step(settings)
+    check_step_by_step(settings)
     try:
         model = SAC.load(source_model, env=target, device=device, **settings)
     except AttributeError as error:  # of an optimizer of the temperature, in the zip alone or in the model alone
@@ -62,7 +62,11 @@ def fine_tuned_sac(
     return model
 
 
-def _check_step_by_step(settings: Mapping[str, Any]) -> None:
+def check_step_by_step(settings: Mapping[str, Any]) -> None:
+    """Refuse a ``train_freq`` that would overrun a budget of target steps.
+
+    :raises ValueError: with the remedy
+    """
     if settings.get("train_freq", 1) not in (1, STEP_BY_STEP):
         raise ValueError(
             f"train_freq is {settings['train_freq']!r}, and a budget of target steps is met step by step: give 1, and "
@@ -115,7 +119,7 @@ def with_more_critics(
     :param settings: arguments of SAC that win over the source model's
     :raises ValueError: for fewer critics than the source model has, or another ``train_freq`` than 1
     """
-    _check_step_by_step(settings)
+    check_step_by_step(settings)
     source = fine_tuned_sac(source_model, target, seed, device)
     old = source.critic.q_networks
     if n_critics < len(old):
