@@ -95,6 +95,8 @@ METHODS: dict[str, tuple[str, tuple[int, ...], dict[str, Any]]] = {
     # The closed loop without its library: what learning on in a fitted, incomplete simulator is worth.
     "RPTO-physical, declared alone": ("rpto", SHORT, {**PHYSICAL, "close_loop": []}),
     "RPTO-physical, closed loop": ("rpto", SHORT, {**PHYSICAL, "close_loop": True}),
+    # Told of no number that may differ: the trace has to find these, too.
+    "RPTO-physical, nothing declared": ("rpto", SHORT, {**PHYSICAL, "close_loop": True, "declared": []}),
     # Before its first target step it is what domain randomisation makes of the source's policy.
     "randomised, SAC-warm": ("sac-warm", SHORT, {"gradient_steps": 1}),
 }
@@ -230,7 +232,7 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
     if method == "rpto":
         kwargs["source_data"] = data
         if kwargs["dynamics"] == "physical":
-            kwargs["declared"] = list(TASKS[job.task].declared)
+            kwargs.setdefault("declared", list(TASKS[job.task].declared))
         if job.sensors and "close_loop" in kwargs:
             noise = sensor_noise(job.task, make_source(job.task), job.sensors)
             kwargs["dynamics_kwargs"] = {"observation_noise": noise.tolist()}
