@@ -13,9 +13,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
+from sb3_rpto.commands.terminal import lines
 from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
 from sb3_rpto.files import plain, write_json
 
@@ -29,9 +31,11 @@ class RunFolder:
     """Everything of one run. ``result.json`` is written last, so it is there when the run is finished.
 
     :param path: the folder
+    :param lock: held while this process writes there
     """
 
     path: Path
+    lock: FileLock | None = None
 
     @property
     def model(self) -> Path:
@@ -72,10 +76,11 @@ class RunFolder:
 
         :param path: of the folder; it is made where it is not there
         :param config: all that decides the outcome, as JSON has it
-        :raises ValueError: when the folder holds a run of another configuration, or what no run of ours wrote
+        :raises ValueError: when the folder holds a run of another configuration, or what no run of ours wrote, or
+            another process runs there
         """
-        run, asked = cls(path), plain(config)
         path.mkdir(parents=True, exist_ok=True)
+        run, asked = cls(path, _alone_in(path)), plain(config)
         begun = run.begun()
         if begun is None:
             for kept in (run.config, run.model, run.replay_buffer, run.result, run.checkpoints):
@@ -126,6 +131,18 @@ class RunFolder:
         return found[-1] if found else None
 
 
+def _alone_in(folder: Path) -> FileLock:
+    """A lock that no other process gets while this one holds it; it ends with the process, however that ends."""
+    lock = FileLock(folder / ".lock", is_singleton=True)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise ValueError(
+            f"--out {folder}: another process runs there; wait until it ends, or give another folder"
+        ) from error
+    return lock
+
+
 def beside(folder: Path, file: str | None) -> str | None:
     """The path of a file from a run's folder, which holds wherever the command is given."""
     return None if file is None else os.path.relpath(Path(file).resolve(), folder.resolve())
@@ -142,8 +159,9 @@ def _same_file(folder: Path, begun: dict[str, Any], asked: dict[str, Any], name:
 class SavedCurve(LearningCurve):
     """A learning curve that tells its rows as they come and leaves a checkpoint after each.
 
-    A checkpoint of ours is written at the step itself and resumes bit for bit. Of SB3's own algorithms it is written
-    when the update that follows is over, before the next rollout.
+    The last return is that of the model as the run leaves it, after the last updates. A checkpoint of ours is written
+    at the step itself and resumes bit for bit. Of SB3's own algorithms it is written when the update that follows is
+    over, before the next rollout.
 
     :param run: whose checkpoints
     :param make_env: makes an evaluation environment
@@ -201,7 +219,13 @@ class SavedCurve(LearningCurve):
         if self.say is not None:
             self.say(f"going on from {folder}")
 
+    def _waits(self, steps: int) -> bool:
+        return self.after_update or steps == self.total
+
     def _on_training_start(self) -> None:
+        loop = getattr(self.model, "loop", None)
+        if loop is not None and self.say is not None:
+            loop.progress = lines()  # a trace takes minutes
         if self._resumed:
             self._since = time.perf_counter()
         else:

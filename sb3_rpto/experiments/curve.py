@@ -96,9 +96,13 @@ class LearningCurve(BaseCallback):
         steps, every = self.num_timesteps, self.every
         if steps % every == 0 if isinstance(every, int) else steps in every:
             self._due = steps
-            if not self.after_update:
+            if not self._waits(steps):
                 self._evaluate_due()
         return True
+
+    def _waits(self, steps: int) -> bool:
+        """Whether the evaluation at this step is made when the update that follows is over."""
+        return self.after_update
 
     def _on_training_end(self) -> None:
         self._evaluate_due()

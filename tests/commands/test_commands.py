@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -15,6 +17,7 @@ import pandas as pd
 import pytest
 import torch as th
 from stable_baselines3 import A2C, PPO, SAC
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import load_from_pkl
 
 from sb3_rpto import RPO, RPTO, cli
@@ -23,6 +26,7 @@ from sb3_rpto.commands import enjoy, options, video
 from sb3_rpto.commands.plot import draw, read_rows
 from sb3_rpto.commands.policies import load_policy
 from sb3_rpto.commands.runs import RunFolder, SavedCurve
+from sb3_rpto.experiments.curve import evaluate
 from sb3_rpto.experiments.report import summarise
 
 SOURCE, TARGET = "rpto/ContinuousCartPole-v0", "rpto/ContinuousCartPole-limb-x2-v0"
@@ -89,7 +93,7 @@ def error(capsys: pytest.CaptureFixture[str]) -> str:
 
 def test_train_writes_agent_data_and_result(agent: Path) -> None:
     assert sorted(path.name for path in agent.iterdir()) == [
-        *("config.json", "model.zip", "replay_buffer.pkl", "result.json")
+        *(".lock", "config.json", "model.zip", "replay_buffer.pkl", "result.json")
     ]
     model = SAC.load(agent / "model.zip", device="cpu")
     assert (model.num_timesteps, model.gamma) == (60, 0.98)  # gamma is of hyperparams/zoo/sac.yml
@@ -178,6 +182,15 @@ def test_the_budget_is_that_of_the_task(agent: Path, tmp_path: Path) -> None:
     given = ["transfer", str(agent / "model.zip"), TARGET, "--method", "zero-shot", "--episodes", "1", "--quiet"]
     assert cli.main([*given, "--out", str(tmp_path)]) == 0
     assert json.loads((tmp_path / "config.json").read_text())["steps"] == 1_000
+
+
+@pytest.mark.parametrize("method", ["sac-warm", "rpto"])
+def test_the_last_return_is_that_of_the_model_that_is_written(method: str, agent: Path, tmp_path: Path) -> None:
+    """Updates as large as these change what a policy earns; the last of them come after the last target step."""
+    assert transfer(agent, tmp_path, method, "--set", "learning_rate=0.1") == 0
+    written = load_policy(tmp_path / "model.zip", "ZIP")
+    worlds = make_vec_env(partial(gym.make, TARGET), n_envs=2)
+    assert evaluate(written, worlds, 2, seed=0) == rows(tmp_path)[-1]["return"]
 
 
 def test_a_checkpoint_is_replaced_as_a_whole(tmp_path: Path) -> None:
@@ -380,6 +393,17 @@ def test_what_a_killed_checkpoint_left_is_not_in_the_way(tmp_path: Path) -> None
     newest = run.newest_checkpoint()
     assert newest is not None
     assert [path.name for path in newest.iterdir()] == ["whole"]
+
+
+def test_two_processes_do_not_share_a_folder(tmp_path: Path) -> None:
+    config = {"command": "train", "a": 1}
+    run = RunFolder.open(tmp_path, config)
+    imports = "from pathlib import Path; from sb3_rpto.commands.runs import RunFolder"
+    other = f"{imports}; RunFolder.open(Path({str(tmp_path)!r}), {config})"
+    told = subprocess.run([sys.executable, "-c", other], capture_output=True, text=True, check=False)
+    assert "another process runs there; wait until it ends, or give another folder" in told.stderr
+    del run
+    subprocess.run([sys.executable, "-c", other], check=True)
 
 
 def test_a_run_is_the_same_from_everywhere(agent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
