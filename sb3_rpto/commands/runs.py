@@ -80,12 +80,9 @@ class RunFolder:
             another process runs there
         """
         path.mkdir(parents=True, exist_ok=True)
+        cls(path)._check_ours()
         run, asked = cls(path, _alone_in(path)), plain(config)
         begun = run.begun()
-        if begun is None:
-            for kept in (run.config, run.model, run.replay_buffer, run.result, run.checkpoints):
-                if kept.exists():
-                    raise ValueError(f"--out {path} holds a {kept.name} that no run of ours wrote; give another folder")
         if begun is None or (not run.result.exists() and run.newest_checkpoint() is None):
             write_json(run.config, asked)
             return run
@@ -98,6 +95,14 @@ class RunFolder:
                 "folder, or repeat the command that began it to go on"
             )
         return run
+
+    def _check_ours(self) -> None:
+        if self.begun() is None:
+            for kept in (self.config, self.model, self.replay_buffer, self.result, self.checkpoints):
+                if kept.exists():
+                    raise ValueError(
+                        f"--out {self.path} holds a {kept.name} that no run of ours wrote; give another folder"
+                    )
 
     def finish(self, rows: list[dict[str, Any]]) -> None:
         """Write the result and forget the checkpoints.
