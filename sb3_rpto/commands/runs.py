@@ -166,7 +166,7 @@ class SavedCurve(LearningCurve):
 
     The last return is that of the model as the run leaves it, after the last updates. A checkpoint of ours is written
     at the step itself and resumes bit for bit. Of SB3's own algorithms it is written when the update that follows is
-    over, before the next rollout.
+    over, before the next rollout. Where a loop is closed, the report of its last trace goes to the run's folder.
 
     :param run: whose checkpoints
     :param make_env: makes an evaluation environment
@@ -199,6 +199,7 @@ class SavedCurve(LearningCurve):
         #: the model that the newest row is of
         self.judged: Any = None
         self._unsaved = self._resumed = False
+        self._reported = 0
 
     def evaluate(self, model: Any, steps: int) -> None:
         """Add a row, and tell of it."""
@@ -237,9 +238,26 @@ class SavedCurve(LearningCurve):
             super()._on_training_start()
 
     def _on_rollout_start(self) -> None:
+        self._report()
         super()._on_rollout_start()
         if not isinstance(self.model, TransferAlgorithm):
             self._save()
+
+    def _on_training_end(self) -> None:
+        self._report()
+        super()._on_training_end()
+
+    def _report(self) -> None:
+        """Write what a trace has found since the last rollout."""
+        loop = getattr(self.model, "loop", None)
+        if loop is None or len(loop.reports) == self._reported:
+            return
+        self._reported, report = len(loop.reports), loop.reports[-1]
+        report.save(self.run.path)
+        if self.say is not None:
+            named = ", ".join(found.label for found in report.effects) or "nothing"
+            page = self.run.path / "report.html"
+            self.say(f"{self.num_timesteps:>9,} steps: {report.verdict}, {named} named; written: {page}")
 
     def _on_step(self) -> bool:
         super()._on_step()

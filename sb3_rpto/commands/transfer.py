@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_rpto.commands import options
+from sb3_rpto.commands import options, recordings
 
 if TYPE_CHECKING:
     from sb3_rpto.commands.runs import SavedCurve
@@ -28,7 +28,8 @@ example:
   sb3-rpto transfer runs/hopper-source/model.zip rpto/Hopper-target0-v0 --method rpto \\
     --source-data runs/hopper-source/replay_buffer.pkl --out runs/hopper-rpto
 
-writes into DIR model.zip and result.json (configuration and learning curve).
+writes into DIR model.zip and result.json (configuration and learning curve); with
+--set close_loop=true also report.html, report.json and the corrected simulator.
 """
 
 #: What methods that load SAC's zip take beside SAC's arguments.
@@ -72,6 +73,7 @@ def run(parsed: argparse.Namespace) -> int:
     from sb3_rpto.experiments.methods import REGISTRY, Run
     from sb3_rpto.experiments.sources import digest
     from sb3_rpto.files import write_atomically
+    from sb3_rpto.tracing import figures
     from sb3_rpto.zoo.settings import ALGORITHMS, shipped_settings
 
     options.check_positive(parsed, "steps", "every", "episodes")
@@ -89,6 +91,9 @@ def run(parsed: argparse.Namespace) -> int:
     steps = parsed.steps or budget
     _check_settings(parsed.method, settings, steps)
     _check_worlds(parsed, source, target)
+    if settings.get("close_loop"):
+        figures.require()
+        recordings.check_out(parsed.out, source.make())
     every = parsed.every or max(steps // 10, 1)
     config = {
         "command": "transfer",

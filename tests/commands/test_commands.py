@@ -26,6 +26,7 @@ from sb3_rpto.commands import enjoy, options, video
 from sb3_rpto.commands.plot import draw, read_rows
 from sb3_rpto.commands.policies import load_policy
 from sb3_rpto.commands.runs import RunFolder, SavedCurve
+from sb3_rpto.effects.carry import load_corrected
 from sb3_rpto.experiments.curve import evaluate
 from sb3_rpto.experiments.report import summarise
 
@@ -191,6 +192,27 @@ def test_the_last_return_is_that_of_the_model_that_is_written(method: str, agent
     written = load_policy(tmp_path / "model.zip", "ZIP")
     worlds = make_vec_env(partial(gym.make, TARGET), n_envs=2)
     assert evaluate(written, worlds, 2, seed=0) == rows(tmp_path)[-1]["return"]
+
+
+@pytest.mark.slow
+def test_a_closed_loop_leaves_its_report_and_the_corrected_simulator(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = {"net_arch": [16]}
+    SAC("MlpPolicy", gym.make("InvertedDoublePendulum-v5"), policy_kwargs=small, seed=0, device="cpu").save(
+        tmp_path / "agent.zip"
+    )
+    closed = ["dynamics=physical", "close_loop=[link_length]", "retrain_steps=16", "source_steps=1", "gradient_steps=1"]
+    given = [str(tmp_path / "agent.zip"), "rpto/InvertedDoublePendulum-limb-x2-v0", "--steps", "200", "--every", "100"]
+    settings = [text for setting in closed for text in ("--set", setting)]
+    out = tmp_path / "run"
+    assert cli.main(["transfer", *given, *settings, "--episodes", "2", "--device", "cpu", "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert f"200 steps: explained, link_length(pole2) named; written: {out / 'report.html'}" in said.out
+    assert "predicting the test runs" in said.err
+    (found,) = json.loads((out / "report.json").read_text())["effects"]
+    assert found["parameters"]["change"]["value"] == pytest.approx(1.0, abs=1e-3)
+    assert [effect.label for effect in load_corrected(out).effects] == ["link_length(pole2)"]
 
 
 def test_a_checkpoint_is_replaced_as_a_whole(tmp_path: Path) -> None:
