@@ -50,11 +50,24 @@ def test_the_probe_leaves_the_setting_and_refuses_what_is_inaccurate(monkeypatch
     pays.cache_clear()
 
 
-def test_the_probe_refuses_what_is_not_faster(monkeypatch):
+@pytest.mark.parametrize(("gain", "chosen"), [(1.0, False), (1.2, False), (2.0, True)])
+@pytest.mark.parametrize("busy", [range(0), range(50), range(40, 100)])
+def test_a_busy_machine_chooses_as_an_idle_one(monkeypatch, gain, chosen, busy):
+    """Other work takes three times as long as a product, for a part of the probe."""
+    calls = iter(range(2 * 2 * products.ROUNDS))
+    clock = [0.0]
+
+    def now():
+        call = next(calls)
+        if call % 2:
+            product = 1.0 if th.get_float32_matmul_precision() == "highest" else 1.0 / gain
+            clock[0] += product * (4.0 if call // 4 in busy else 1.0)
+        return clock[0]
+
     pays.cache_clear()
-    monkeypatch.setattr(products, "_fastest", lambda *_: 1.0)
-    assert not pays()
-    monkeypatch.undo()
+    monkeypatch.setattr(products, "ACCURATE", 1.0)
+    monkeypatch.setattr(products.time, "perf_counter", now)
+    assert pays() == chosen
     pays.cache_clear()
 
 
