@@ -91,7 +91,7 @@ def run(parsed: argparse.Namespace) -> int:
     steps = parsed.steps or budget
     _check_settings(parsed.method, settings, steps)
     _check_worlds(parsed, source, target)
-    if settings.get("close_loop"):
+    if settings.get("close_loop", False) is not False:  # an empty list traces, too
         figures.require()
         recordings.check_out(parsed.out, source.make())
     every = parsed.every or max(steps // 10, 1)
