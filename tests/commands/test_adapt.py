@@ -57,7 +57,16 @@ def test_a_log_becomes_a_report_a_simulator_and_a_policy(given: Path, tmp_path: 
     said = capsys.readouterr().out
     assert said.startswith("explained\n")
     assert said.endswith(f"in the corrected simulator; written: {tmp_path / 'model.zip'}\n")
-    names = {"config.json", "effects.json", "model.xml", "model.zip", "report.html", "report.json", "result.json"}
+    names = {
+        ".lock",
+        "config.json",
+        "effects.json",
+        "model.xml",
+        "model.zip",
+        "report.html",
+        "report.json",
+        "result.json",
+    }
     assert {path.name for path in tmp_path.iterdir()} == names
     (pull,) = load_corrected(tmp_path).effects
     assert pull.label == "torque_offset(hinge)"
