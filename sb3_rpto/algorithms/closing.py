@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -71,6 +71,8 @@ class LoopCloser:
         self._error = math.inf
         #: called while it traces, as :func:`~sb3_rpto.tracing.trace.trace` calls it; no checkpoint holds it
         self.progress: Progress | None = None
+        #: called with each report, before the policy learns in what it corrects; no checkpoint holds it
+        self.on_report: Callable[[Report], None] | None = None
         #: whether the last transitions held too few windows to be traced
         self._untraced = False
         #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
@@ -89,7 +91,7 @@ class LoopCloser:
         self.rehearsals = Rehearsals()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "reports": [], "progress": None}
+        return {**vars(self), "reports": [], "progress": None, "on_report": None}
 
     def forget_target(self) -> None:
         """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""
@@ -148,7 +150,7 @@ class LoopCloser:
         self._traced_at, self._untraced = model.replay_buffer.target_added, False
         added = self._take(model, dynamics, report, data, before if noise is None else math.inf)
         self._error = dynamics.error(data)
-        _say(model, report, added, f"{len(data)} target transitions", before, self._error)
+        self._say(model, report, added, f"{len(data)} target transitions", before, self._error)
         self.stale = bool(added) or outdated(model, dynamics)
         self.renew(model)
 
@@ -172,7 +174,7 @@ class LoopCloser:
         self.fill_target(model, dynamics, measured)
         self.log_is_empty = model.replay_buffer.target.size() == 0
         self.stale = model.replay_buffer.source.size() > 0 or not model._warm
-        _say(model, report, added, f"{len(measured.episodes)} recorded episodes", before, dynamics.error(data))
+        self._say(model, report, added, f"{len(measured.episodes)} recorded episodes", before, dynamics.error(data))
 
     def fill_target(self, model: Looping, dynamics: PhysicalDynamics, measured: Measurements) -> None:
         """Let D_target hold a log that was traced, as the corrected machine would have shown it."""
@@ -290,6 +292,33 @@ class LoopCloser:
         self.accounts = report.verdict in SETTLED
         return report
 
+    def _say(self, model: Looping, report: Report, added: list[str], data: str, before: float, after: float) -> None:
+        """Tell and log what a trace found, and what it did to the one-step error."""
+        if self.on_report is not None:
+            self.on_report(report)
+        logger = model.logger
+        logger.record("gap/residual_before", before)
+        logger.record("gap/residual_after", after)
+        logger.record("gap/adequacy_before", report.adequacy_before.ratio)
+        logger.record("gap/adequacy_after", report.adequacy_after.ratio)
+        logger.record("gap/verdict", report.verdict)
+        logger.record("gap/effects", ", ".join(added) or "none", exclude="tensorboard")
+        model.dump_logs()  # SB3 waits for the end of some episodes, before which a short run is over
+        if model.verbose:
+            print(f"traced on {data}: {report.verdict}; {', '.join(added) or 'nothing'} added")
+        if report.verdict == "unexplained":
+            known = model.measured is not None or model.dynamics_kwargs.get("observation_noise") is not None
+            steps = "".join(f". {f.message}" for f in report.findings if f.kind == "time step")
+            bounds = "".join(f". {f.where}: {f.message}" for f in report.findings if f.kind == "at its bound")
+            noise = "" if known else "whether they are noisy (dynamics_kwargs={'observation_noise': ...}), "
+            warnings.warn(
+                f"the trace on {data} is 'unexplained': what it looked for does not account for the difference, and "
+                "the policy learns in a simulator that still errs; see print(model.loop.reports[-1]) for which joints, "
+                f"and whether the observations hold the model's joints in its order, {noise}what else could be "
+                f"declared, and dynamics='residual'{steps}{bounds}",
+                stacklevel=3,
+            )
+
     def _take(
         self,
         model: Looping,
@@ -360,32 +389,6 @@ def trace_log(model: Looping) -> None:
         loop.fill_target(model, dynamics, model.measured)
     else:
         loop.close_on_log(model, dynamics, model.measured)
-
-
-def _say(model: Looping, report: Report, added: list[str], data: str, before: float, after: float) -> None:
-    """Log what a trace found, and what it did to the one-step error."""
-    logger = model.logger
-    logger.record("gap/residual_before", before)
-    logger.record("gap/residual_after", after)
-    logger.record("gap/adequacy_before", report.adequacy_before.ratio)
-    logger.record("gap/adequacy_after", report.adequacy_after.ratio)
-    logger.record("gap/verdict", report.verdict)
-    logger.record("gap/effects", ", ".join(added) or "none", exclude="tensorboard")
-    model.dump_logs()  # SB3 waits for the end of some episodes, before which a short run is over
-    if model.verbose:
-        print(f"traced on {data}: {report.verdict}; {', '.join(added) or 'nothing'} added")
-    if report.verdict == "unexplained":
-        known = model.measured is not None or model.dynamics_kwargs.get("observation_noise") is not None
-        steps = "".join(f". {f.message}" for f in report.findings if f.kind == "time step")
-        bounds = "".join(f". {f.where}: {f.message}" for f in report.findings if f.kind == "at its bound")
-        noise = "" if known else "whether they are noisy (dynamics_kwargs={'observation_noise': ...}), "
-        warnings.warn(
-            f"the trace on {data} is 'unexplained': what it looked for does not account for the difference, and the "
-            "policy learns in a simulator that still errs; see print(model.loop.reports[-1]) for which joints, and "
-            f"whether the observations hold the model's joints in its order, {noise}what else could be declared, and "
-            f"dynamics='residual'{steps}{bounds}",
-            stacklevel=3,
-        )
 
 
 def horizon_of(measured: Measurements, env: gym.Env) -> float:

@@ -197,7 +197,10 @@ def _collect_in_source(model: Resumable, n_steps: int) -> None:
 
 def _fit_phi_0(model: Resumable, dynamics: Dynamics) -> None:
     """Let the learned dynamics describe the source before the first target step (Algorithm 1's input)."""
-    for name, value in dynamics.fit(model.transitions("source"), max_steps=PHI_0_UPDATES).items():
+    data = model.transitions("source")
+    if model.verbose:
+        print(f"fitting the model of the source to {len(data):,} transitions, which takes minutes on a CPU")
+    for name, value in dynamics.fit(data, max_steps=PHI_0_UPDATES).items():
         model.logger.record(f"dynamics/phi_0_{name}", value)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -20,6 +20,9 @@ from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.commands.terminal import lines
 from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
 from sb3_rpto.files import plain, write_json
+
+if TYPE_CHECKING:
+    from sb3_rpto.tracing import Report
 
 #: In a checkpoint: the class of its model, and the rows until then.
 CURVE = "curve.json"
@@ -199,7 +202,6 @@ class SavedCurve(LearningCurve):
         #: the model that the newest row is of
         self.judged: Any = None
         self._unsaved = self._resumed = False
-        self._reported = 0
 
     def evaluate(self, model: Any, steps: int) -> None:
         """Add a row, and tell of it."""
@@ -230,29 +232,21 @@ class SavedCurve(LearningCurve):
 
     def _on_training_start(self) -> None:
         loop = getattr(self.model, "loop", None)
-        if loop is not None and self.say is not None:
-            loop.progress = lines()  # a trace takes minutes
+        if loop is not None:
+            loop.on_report = self._report
+            loop.progress = None if self.say is None else lines()  # a trace takes minutes
         if self._resumed:
             self._since = time.perf_counter()
         else:
             super()._on_training_start()
 
     def _on_rollout_start(self) -> None:
-        self._report()
         super()._on_rollout_start()
         if not isinstance(self.model, TransferAlgorithm):
             self._save()
 
-    def _on_training_end(self) -> None:
-        self._report()
-        super()._on_training_end()
-
-    def _report(self) -> None:
-        """Write what a trace has found since the last rollout."""
-        loop = getattr(self.model, "loop", None)
-        if loop is None or len(loop.reports) == self._reported:
-            return
-        self._reported, report = len(loop.reports), loop.reports[-1]
+    def _report(self, report: Report) -> None:
+        """Write what a trace has found."""
         report.save(self.run.path)
         if self.say is not None:
             named = ", ".join(found.label for found in report.effects) or "nothing"

@@ -67,12 +67,19 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(renewal, "FILL", 25)
 
 
+#: Reports that :func:`learned` was told of, and how many updates it had made by then.
+TOLD: list[tuple[Report, int]] = []
+
+
 @cache
 def learned() -> RPTO:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(closing, "FIRST", 80)
         patch.setattr(renewal, "FILL", 25)
-        return model(friction()).learn(100, source_timesteps=100)
+        made = model(friction())
+        assert made.loop is not None
+        made.loop.on_report = lambda report: TOLD.append((report, made._n_updates))
+        return made.learn(100, source_timesteps=100)
 
 
 def dynamics(made: RPTO) -> PhysicalDynamics:
@@ -89,6 +96,15 @@ def test_an_undeclared_effect_is_named_added_and_fitted() -> None:
     values = dynamics(made).describe()
     assert values["coulomb_friction(slider).level"] == pytest.approx(LEVEL, rel=0.01)
     assert values["pole.length"] == pytest.approx(LENGTH * 0.6, rel=0.01)
+
+
+def test_a_report_is_told_before_the_policy_learns_in_what_it_corrects() -> None:
+    made = learned()
+    assert made.loop is not None
+    ((report, updates),) = TOLD
+    assert report is made.loop.reports[0]
+    owed = 100 - 80  # updates that the last target steps pay for
+    assert updates + owed < made._n_updates
 
 
 @pytest.mark.slow
