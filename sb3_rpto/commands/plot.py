@@ -85,7 +85,7 @@ def read_rows(paths: Sequence[Path]) -> list[dict[str, Any]]:
             rows += found or []
     if not rows:
         raise ValueError(f"RESULT: there are no result files in {', '.join(map(str, paths))}")
-    return _labelled(rows)
+    return _once(_labelled(rows))
 
 
 def _labelled(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -112,6 +112,17 @@ def _told_apart(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     several = {(target, method) for (target, method, _), agents in runs.items() if len(agents) > 1}
     apart = [(row["target"], row["method"]) in several for row in rows]
     return [{**row, "method": f"{row['method']} agent={row['agent']}"} if a else row for row, a in zip(rows, apart)]
+
+
+def _once(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows without those of runs that are there already: a seed counts once."""
+    first: dict[tuple[str, str, int], str] = {}
+    for row in rows:
+        first.setdefault((row["target"], row["method"], row["seed"]), row["run"])
+    kept = [row for row in rows if first[row["target"], row["method"], row["seed"]] == row["run"]]
+    for run in sorted({row["run"] for row in rows} - {row["run"] for row in kept}):
+        print(f"sb3-rpto: left out, the same seed of the same method is there: {run}", file=sys.stderr)
+    return kept
 
 
 def _result(file: Path) -> list[dict[str, Any]] | None:

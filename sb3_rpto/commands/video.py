@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -41,11 +42,14 @@ def require(path: Path) -> None:
     """Refuse what cannot be written, before anything is run.
 
     :param path: of the film
-    :raises ValueError: for another suffix
+    :raises ValueError: for another suffix, or a folder that takes no files
     :raises ImportError: with the extra that is missing
     """
     if path.suffix not in SUFFIXES:
         raise ValueError(f"--video {path}: a film is {' or '.join(SUFFIXES)}")
+    made = next(folder for folder in path.absolute().parents if folder.exists())  # the others are made
+    if not (made.is_dir() and os.access(made, os.W_OK)):
+        raise ValueError(f"--video {path}: nothing can be written into {made}; give another folder")
     needed = ("imageio", "PIL", *(("imageio_ffmpeg",) if path.suffix == ".mp4" else ()))
     missing = [name for name in needed if find_spec(name) is None]
     if missing:

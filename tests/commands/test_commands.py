@@ -363,6 +363,7 @@ BAD = {
     "enjoy BEGUN": "its run is not finished",
     "train ContinuousCartPole --out O --seed -1": "--seed is -1",
     "enjoy A --video f.avi": "a film is .mp4 or .gif",
+    "enjoy A --video A/model.zip/f.gif": "nothing can be written into",
     "enjoy A --video f.gif": "--source-model",
 }
 
@@ -471,7 +472,7 @@ def test_enjoy_runs_policies_of_other_algorithms(kind: str, tmp_path: Path) -> N
 NOTHING = {"target": {"id": TARGET, "shift": ""}, "rows": []}
 
 
-def test_plot_tells_source_agents_apart_where_seeds_do_not(tmp_path: Path) -> None:
+def test_plot_tells_source_agents_apart_where_seeds_do_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def finished(name: str, seed: int, agent: str, **more: object) -> Path:
         config = {"method": "rpto", "target": TARGET, "seed": seed, "source_model_sha256": agent * 8, **more}
         (tmp_path / f"{name}.json").write_text(json.dumps({"config": config, "rows": [{"steps": 20, "return": 1.0}]}))
@@ -483,6 +484,9 @@ def test_plot_tells_source_agents_apart_where_seeds_do_not(tmp_path: Path) -> No
     assert {row["method"] for row in read_rows(both)} == {f"rpto agent={name * 4}" for name in ("aa", "bb", "cc")}
     judged = [*each, finished("d", 2, "dd", episodes=3)]
     assert {row["method"] for row in read_rows(judged)} == {"rpto episodes=default", "rpto episodes=3"}
+    again = finished("again", 0, "aa")
+    assert [row["seed"] for row in read_rows([*each, again])] == [0, 1], "a seed counts once"
+    assert f"the same seed of the same method is there: {again}" in capsys.readouterr().err
 
 
 def test_a_line_is_of_the_same_runs_from_end_to_end() -> None:
