@@ -37,7 +37,7 @@ ROBOTS = {
 #: Transitions of uniformly random actions.
 TRANSITIONS = 300
 #: What is put in: sizes are shares of the largest force of the joint's motor, at the speed in rad/s or m/s that
-#: follows, of the command, or of a step of the environment.
+#: follows, of the command that is left out where commands are amplified, or of a step of the environment.
 KINDS = {
     "coulomb_friction": (0.1, 0.0),
     "soft_friction": (0.1, 0.0),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import copy
 import importlib
 import importlib.util
 import json
@@ -335,7 +336,7 @@ def learning_curve(task: Task, arguments: dict[str, Any] | None = None) -> list[
     make_source, make_target = worlds(job.task, job.target)
     method = {**REGISTRY, **ABLATED}[job.method]
     curve = LearningCurve(make_target, job.points, job.episodes, job.seed, read, after_update=method.in_batches)
-    settings = dict(job.settings)
+    settings = copy.deepcopy(dict(job.settings))  # SAC writes into its policy_kwargs
     method.run(Run(task.agent, make_source, make_target, job.points[-1], job.seed, 1, task.data, settings), curve)
     curve.env.close()
     return curve.rows

@@ -87,6 +87,24 @@ def test_finished_runs_are_not_repeated_and_torn_failed_or_other_ones_are(tmp_pa
     assert worked == ["ContinuousCartPole_limb-x2_sac-warm_1"]
 
 
+@pytest.mark.parametrize("suite", ["quick", "ablation", "further"])
+def test_the_committed_runs_are_those_that_their_suite_plans(suite: str) -> None:
+    folder = ROOT / "examples" / "results" / f"transfer_{suite}" / "runs"
+    found = {path.stem: json.loads(path.read_text())["job"] for path in folder.glob("*.json")}
+    planned = {job.name: job.to_json() for job in jobs(SUITES[suite])}
+    assert found
+    assert {name: planned.get(name) for name in found} == found, "they would be made again"
+
+
+def test_a_run_with_settings_that_sac_writes_into_is_not_repeated(tmp_path: Path, worked: list[str]) -> None:
+    """It notes in the policy_kwargs that it is given whether it explores by gSDE."""
+    for _ in range(2):  # planned anew, as another process would
+        sac = Variant("sac", "sac", settings={"policy_kwargs": {"net_arch": [8]}}, seeds=1)
+        sweep.run(replace(SUITE, places=(replace(PLACE, variants=(sac,)),)), tmp_path, workers=1)
+        assert len(worked) == 1
+        assert json.loads((tmp_path / "runs" / f"{worked[0]}.json").read_text())["error"] is None
+
+
 def test_a_run_from_another_source_agent_is_made_again(made: Path, tmp_path: Path) -> None:
     (job, *_) = jobs(SUITE)
     agent = tmp_path / "agent.zip"
