@@ -199,7 +199,7 @@ def _fit_phi_0(model: Resumable, dynamics: Dynamics) -> None:
     """Let the learned dynamics describe the source before the first target step (Algorithm 1's input)."""
     data = model.transitions("source")
     if model.verbose:
-        print(f"fitting the model of the source to {len(data):,} transitions, which takes minutes on a CPU")
+        print(f"fitting the model of the source to {len(data):,} transitions, which may take minutes on a CPU")
     for name, value in dynamics.fit(data, max_steps=PHI_0_UPDATES).items():
         model.logger.record(f"dynamics/phi_0_{name}", value)
 
