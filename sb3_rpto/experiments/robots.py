@@ -37,13 +37,13 @@ ROBOTS = {
 #: Transitions of uniformly random actions.
 TRANSITIONS = 300
 #: What is put in: sizes are shares of the largest force of the joint's motor, at the speed in rad/s or m/s that
-#: follows, of the command that is left out where commands are amplified, or of a step of the environment.
+#: follows, of the command that is added to it, or of a step of the environment.
 KINDS = {
     "coulomb_friction": (0.1, 0.0),
     "soft_friction": (0.1, 0.0),
     "quadratic_drag": (0.1, 5.0),
     "torque_offset": (0.1, 0.0),
-    "command_gain": (0.2, 0.0),
+    "command_gain": (0.8, 0.0),
     "command_delay": (0.5, 0.0),
 }
 #: What no effect of the library is has an amplitude of such a share.
@@ -80,7 +80,7 @@ def make_target(job: Job) -> tuple[gym.Env, list[Effect]]:
             value = size * peak_force(model, joint) / (speed**2 or 1.0)
         else:
             effect = LIBRARY[job.kind](object_names(model, "actuator")[motor])
-            value = size * robot.dt if job.kind == "command_delay" else 1 - size
+            value = size * robot.dt if job.kind == "command_delay" else size
         effect.bind(model)
         effects.append(effect.with_values(np.array([value])))
     target: gym.Env = apply_effects(env, effects)
