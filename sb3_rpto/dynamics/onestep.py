@@ -114,7 +114,7 @@ def as_steps(
     spread = (reached - begun).std(axis=0) if len(rows) else np.zeros(len(ever))
     qpos, qvel = np.split(begun, [model.nq], axis=1)
     scale = np.where(ever & (spread > 1e-8), np.maximum(spread, 1e-8), np.inf)
-    return Steps(rows, qpos, qvel, Drive(drive, earlier * frame_skip), reached, scale)
+    return Steps(rows, qpos, qvel, Drive(drive, earlier * frame_skip, hold=frame_skip), reached, scale)
 
 
 def remembered(model: mujoco.MjModel, frame_skip: int) -> int:

@@ -195,7 +195,7 @@ class PhysicalDynamics(Dynamics):
         qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
         values = np.tile(self.values, (len(observations), 1))
         self.simulation.undo_sensors(values, qpos, qvel)
-        q, v = self.simulation.rollout(values, qpos, qvel, Drive(commands))
+        q, v = self.simulation.rollout(values, qpos, qvel, Drive(commands, hold=self.frame_skip))
         return bool(np.isfinite(q).all() and np.isfinite(v).all())
 
     def declared_at_bounds(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""Torques at a joint that no friction makes: motors and springs."""
+"""Torques at a joint that no friction makes: springs, end stops and motors."""
 
 import mujoco
 import numpy as np
@@ -86,6 +86,34 @@ class Spring(Effect):
         share = np.divide(x[:, 0], total, out=np.zeros_like(total), where=total > 0)
         reference += share * (x[:, 1] - reference)
         add(stiffness, x[:, 0])
+
+
+@register
+class EndStop(Effect):
+    r"""Stops of a joint elsewhere, :math:`q_- + a \le q \le q_+ + b`, as soft as the model's: MuJoCo's ``range``."""
+
+    kind = "end_stop"
+    place = "joint"
+    parameters = (
+        Parameter("lower", "rad", lambda s: 0.03 * s.span),
+        Parameter("upper", "rad", lambda s: 0.03 * s.span),
+    )
+    equation = "q_min + lower <= q <= q_max + upper"
+    native = "range"
+    excite = "motion into both stops"
+    same = ("range",)
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Hinges and slides that have limits."""
+        names = object_names(model, "joint")
+        return [n for n in super().places(model) if model.jnt_limited[names.index(n)]]
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Move the limits; those that would cross meet half-way."""
+        limits = world.field("jnt_range")[:, self.index]
+        limits += x
+        limits[:] = np.where(limits[:, :1] > limits[:, 1:], limits.mean(axis=1, keepdims=True), limits)
 
 
 @register

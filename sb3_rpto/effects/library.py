@@ -21,6 +21,7 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
                                                            quadratic_drag, asymmetric_damping, torque_offset, spring,
                                                            armature, sensor_delay, sensor_bias, sensor_gain
     hinge only                                             torque_ripple, position_friction
+    hinge or slide with limits                             end_stop
     hinge or slide with a motor                            load_friction, directional_load_friction
     actuator                                               command_delay, command_deadband, command_gain,
                                                            command_saturation, backlash, actuator_lag
@@ -32,11 +33,12 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
     =====================================================  ==========================================================
 
     An effect is left out where the same number is declared: ``hinge.damping`` leaves out viscous_friction(hinge),
-    ``frictionloss`` coulomb_friction, ``stiffness`` spring, ``armature`` armature, ``arm.length`` link_length(arm), a
-    geom's ``friction`` geom_friction, an actuator's ``gain``, ``gear`` or ``strength`` command_gain, ``option.density``
-    and ``option.viscosity`` fluid. A declared mass leaves payload in: it moves the centre of mass too.
-    soft_friction and gravity_scale, which no machine has, mass_scale and command_smoothing are left out unless they are
-    named.
+    ``frictionloss`` coulomb_friction, ``stiffness`` spring, ``range`` end_stop, ``armature`` armature, ``arm.length``
+    link_length(arm), a geom's ``friction`` geom_friction, an actuator's ``gain``, ``gear`` or ``strength``
+    command_gain, ``option.density`` and ``option.viscosity`` fluid. A declared mass leaves payload in: it moves the
+    centre of mass too.
+    soft_friction, held forces and gravity_scale, which no machine has, mass_scale and command_smoothing are left out
+    unless they are named.
 
     :param model: the compiled model
     :param exclude: names of declared parameters, as :func:`~sb3_rpto.effects.declare` takes them

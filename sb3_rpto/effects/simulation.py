@@ -30,17 +30,21 @@ class Drive(NamedTuple):
     :param before: steps of commands from before the start, for delays and filters
     :param enabled: (n, steps, nu), 0 where an actuator is off: no command and no back-EMF; None: always on
     :param settings: parameters of the model known for each simulation, by declared name, (n,)
+    :param hold: steps for which a held force is that of their beginning, see ``held`` of
+        :class:`~sb3_rpto.effects.Effect`; the first begin at the start
     """
 
     commands: np.ndarray
     before: int = 0
     enabled: np.ndarray | None = None
     settings: Mapping[str, np.ndarray] = {}
+    hold: int = 1
 
     def take(self, index: np.ndarray) -> Drive:
         """The drive of the simulations at ``index``, which may repeat."""
         enabled = None if self.enabled is None else self.enabled[index]
-        return Drive(self.commands[index], self.before, enabled, {k: v[index] for k, v in self.settings.items()})
+        settings = {k: v[index] for k, v in self.settings.items()}
+        return self._replace(commands=self.commands[index], enabled=enabled, settings=settings)
 
 
 class Simulation:
@@ -111,7 +115,7 @@ class Simulation:
                 seconds = max([memory(self.model), *(CONSTANTS * x for x in slow)])
                 self._lead(world, commands[:, : drive.before], qpos, qvel, seconds)
             world.qpos[:], world.qvel[:] = qpos, qvel
-            self._run(world, active, commands[:, drive.before :], drive.enabled, out_q, out_v)
+            self._run(world, active, drive._replace(commands=commands[:, drive.before :]), out_q, out_v)
         bad = ~(np.isfinite(out_q).all(-1) & (np.abs(out_v) < 1e6).all(-1))
         if bad.any():
             bad = np.maximum.accumulate(bad, axis=1)
@@ -163,20 +167,20 @@ class Simulation:
         self,
         world: BatchWorld,
         active: Active,
-        commands: np.ndarray,
-        enabled: np.ndarray | None,
+        drive: Drive,
         out_q: np.ndarray,
         out_v: np.ndarray,
     ) -> None:
         """Step through all commands and write what was reached after the start."""
+        commands, enabled = drive.commands, drive.enabled
         steps = commands.shape[1]
         acting = pushing(active)
         if acting or enabled is not None:
-            switch = Switch(world, enabled)
+            switch, push = Switch(world, enabled), Push(world, acting)
             for k in range(steps):
                 world.ctrl[:] = commands[:, k]
                 switch(k)
-                push(world, acting)
+                push(begins=k % drive.hold == 0)
                 world.batch.step()
                 out_q[:, k + 1], out_v[:, k + 1] = world.qpos, world.qvel
         else:
@@ -255,13 +259,29 @@ def pushing(active: Active) -> Active:
     return sorted((pair for pair in active if pair[0].overrides("act")), key=lambda pair: pair[0].order)
 
 
-def push(world: World, acting: Active) -> None:
-    """Collect and apply the forces of one substep.
+class Push:
+    """Collects and applies the forces of one substep after another.
 
     :param acting: from :func:`pushing`
     """
-    collect(world, acting)
-    world.commit()
+
+    def __init__(self, world: World, acting: Active) -> None:
+        self.world = world
+        self.held = [pair for pair in acting if pair[0].held]
+        self.acting = [pair for pair in acting if not pair[0].held]
+        self.kept = np.zeros_like(world.force)
+
+    def __call__(self, begins: bool) -> None:
+        """Those of the next substep.
+
+        :param begins: whether a step of the environment begins with it
+        """
+        if begins and self.held:
+            collect(self.world, self.held)
+            self.kept[:] = self.world.force
+        collect(self.world, self.acting)
+        self.world.force += self.kept
+        self.world.commit()
 
 
 def collect(world: World, acting: Active) -> None:

@@ -15,7 +15,7 @@ from gymnasium.utils import EzPickle, RecordConstructorArgs
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.sensors import SensorGain, ago, readers
-from sb3_rpto.effects.simulation import Active, prepare, push, pushing
+from sb3_rpto.effects.simulation import Active, Push, prepare, pushing
 from sb3_rpto.effects.world import LiveWorld
 
 # Where gymnasium's MujocoEnv steps its physics, and what an environment without that method may offer instead.
@@ -231,13 +231,14 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         kept = math.ceil(max(ages.values(), default=0.0) / dt) + 1
         if kept > 1 and not self._past:
             self._past = [(data.qpos.copy(), data.qvel.copy())]
-        for _ in range(n_frames):
+        push = Push(world, acting)
+        for k in range(n_frames):
             sent = command.copy()
             for effect, x, earlier in commanding:
                 sent[effect.ctrl] = effect.command(np.array([sent[effect.ctrl]]), x, earlier, dt)[0]
             data.ctrl[:] = sent
             if acting:
-                push(world, acting)
+                push(begins=k == 0)
                 data.qfrc_applied += others
             mujoco.mj_step(model, data)
             if kept > 1:

@@ -9,6 +9,7 @@ from sb3_rpto.effects import LIBRARY, Declared
 from sb3_rpto.tracing.adequacy import SETTLED, TOLERANCE, judge
 from sb3_rpto.tracing.cautions import DRY, WORSE, creeping
 from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.holding import kinds_when_held, share_left
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.origin import may_be_exact, origin
 from sb3_rpto.tracing.prepare import Progress, SetUp
@@ -16,8 +17,20 @@ from sb3_rpto.tracing.search import Found
 from sb3_rpto.tracing.select import Selection
 from sb3_rpto.tracing.zeros import Zeros, homed, settled, zeros_by_run
 
-#: Dry friction that may give way is looked for where it leaves less than this share of the error.
+#: Dry friction that may give way, or forces that are held, are looked for where they leave less than this share of the
+#: error.
 SOFTER = 0.5
+SOFT = Finding(
+    "soft friction",
+    "fitted runs",
+    "dry friction gives way near rest, as MuJoCo's frictionloss alone does and a machine's hardly",
+)
+HELD = Finding(
+    "held forces",
+    "fitted runs",
+    "forces stay what they are at the beginning of a step of the environment until its end, as where a wrapper writes "
+    "them, and no machine's do",
+)
 #: Recordings, whether they are of a simulator's own steps, and the kinds of effects to look for.
 Prepared = Callable[[Measurements, bool, Sequence[str] | None], SetUp]
 
@@ -63,18 +76,20 @@ def conclude(
     :param seed: of the resampling
     :param say: progress
     """
-    softer = _softer(kinds)
 
     def read(data: Measurements, simulated: bool) -> tuple[SetUp, Found]:
         set_up = prepared(data, simulated, kinds)
         found = search(set_up)
-        if softer and _creeps(found):
-            soft = prepared(data, simulated, softer)
-            then = search(soft)
-            if _explains(then) or then.after.ratio < found.after.ratio:
-                message = "dry friction gives way near rest, as MuJoCo's frictionloss alone does and a machine's hardly"
-                soft.findings.append(Finding("soft friction", "fitted runs", message))
-                return soft, then
+        for seems, others, said in (
+            (_creeps, _softer(kinds), SOFT),
+            (_holds, kinds_when_held(set_up.fitted.exact) if kinds is None else [], HELD),
+        ):
+            if others and not _explains(found) and seems(found):
+                other = prepared(data, simulated, others)
+                then = search(other)
+                if _explains(then) or then.after.ratio < found.after.ratio:
+                    other.findings.append(said)
+                    set_up, found = other, then
         return set_up, found
 
     set_up, found = read(data, simulated)
@@ -110,11 +125,15 @@ def _explains(found: Found) -> bool:
 
 def _creeps(found: Found) -> bool:
     """Whether dry friction that was found leaves what it would not if it gave way at rest."""
-    if _explains(found):
-        return False
     model = found.selection.model
     share = creeping(found.on.fine.every_window(), model.fit.values, model.effects)[1]
     return share < SOFTER or (share < 1 - WORSE and share * found.after.ratio <= 1 + TOLERANCE)
+
+
+def _holds(found: Found) -> bool:
+    """Whether friction, damping or drag that was found leaves what it would not if it were held for a step."""
+    model = found.selection.model
+    return share_left(found.on.fine.every_window(), model.fit.values, model.effects) < SOFTER
 
 
 def _softer(kinds: Sequence[str] | None) -> list[str]:

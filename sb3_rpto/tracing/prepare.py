@@ -218,8 +218,8 @@ def _candidates(
         if unknown:
             raise ValueError(f"candidates: no effect {unknown[0]!r} is registered; {near(unknown[0], sorted(LIBRARY))}")
     labels = {effect.label for effect in there}
-    # What is exact is of a simulator, and may have what no machine has.
-    among = LIBRARY if exact and kinds is None else kinds
+    # What is exact is of a simulator, and may have what no machine has; held forces are looked for apart.
+    among = [kind for kind, e in LIBRARY.items() if not e.held] if exact and kinds is None else kinds
     found = all_candidates(model, [effect.label for effect in there if isinstance(effect, Declared)], among)
     return [e for e in found if e.label not in labels]
 

@@ -289,7 +289,8 @@ def _build(
         else:
             block[w] = block[w - 1]
     settings = {name: np.array([data.episodes[n].params[name] for n, _, _ in starts]) for name in data.columns.params}
-    drive = Drive(commands, before, None if enabled.all() else enabled, settings)
+    hold = max(1, round(data.step / h)) if data.exact or data.simulated else 1
+    drive = Drive(commands, before, None if enabled.all() else enabled, settings, hold)
     return Windows(
         qpos,
         qvel,

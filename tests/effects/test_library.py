@@ -46,6 +46,19 @@ SLED = mujoco.MjModel.from_xml_string("""
   <actuator><motor name="engine" joint="x" gear="60"/></actuator>
 </mujoco>""")
 
+#: An arm that swings into both stops.
+STOPPED = mujoco.MjModel.from_xml_string("""
+<mujoco>
+  <compiler autolimits="true" angle="radian"/><option timestep="0.004"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="hinge" axis="0 1 0" range="-0.5 0.6" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge" gear="12"/></actuator>
+</mujoco>""")
+
 #: One hinge of known inertia whose damping is integrated explicitly, so that a step shows the torque.
 HINGE = mujoco.MjModel.from_xml_string("""
 <mujoco>
@@ -118,6 +131,13 @@ ROWS = {
         {"amplitude": 0.3, "phase": 0.0},
         dry(lambda q, v, m, amplitude, phase: amplitude * np.cos((q - phase) / 2) ** 2),
     ),
+    "held_friction": Row("shoulder", {"level": 0.6}, {"level": 0.1}, dry(lambda q, v, m, level: level)),
+    "held_damping": Row(
+        "shoulder", {"coefficient": 0.2}, {"coefficient": 0.05}, lambda q, v, m, coefficient: -coefficient * v
+    ),
+    "held_drag": Row(
+        "elbow", {"coefficient": 0.05}, {"coefficient": 0.01}, lambda q, v, m, coefficient: -coefficient * v * abs(v)
+    ),
     "torque_ripple": Row(
         "shoulder",
         {"cosine": 0.4, "sine": -0.3, "turns": 7.0},
@@ -131,6 +151,7 @@ ROWS = {
         {"stiffness": 0.2, "reference": 0.0},
         lambda q, v, m, stiffness, reference: -stiffness * (q - reference),
     ),
+    "end_stop": Row("hinge", {"lower": 0.1, "upper": -0.15}, {"lower": 0.02, "upper": -0.05}, model=STOPPED),
     "dc_motor": Row(
         "shoulder_motor",
         {"inverse_stall": 0.14, "inverse_speed": 0.1},
@@ -184,7 +205,7 @@ def excitation(model: mujoco.MjModel, n: int, steps: int = 150) -> tuple[np.ndar
     moving = (np.arange(n) > 0)[:, None] * (model is ARM)
     qpos = model.qpos0 + rng.uniform(-0.5, 0.5, (n, model.nq)) * moving
     qvel = rng.uniform(-2, 2, (n, model.nv)) * moving
-    return qpos, qvel, Drive(commands)
+    return qpos, qvel, Drive(commands, hold=5)
 
 
 def shown(sim: Simulation, values: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, drive: Drive) -> np.ndarray:

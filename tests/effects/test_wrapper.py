@@ -150,9 +150,42 @@ def test_it_steps_as_the_batch_does(kind):
         base.do_simulation(action, base.frame_skip)
         states.append(base.state_vector())
     simulation = Simulation(nominal, chosen, nthread=1)
-    drive = Drive(np.repeat(actions, base.frame_skip, axis=0)[None].astype(float))
+    drive = Drive(np.repeat(actions, base.frame_skip, axis=0)[None].astype(float), hold=base.frame_skip)
     q, v = simulation.rollout(simulation.values()[None], qpos[None], qvel[None], drive)
     np.testing.assert_array_equal(np.array(states), np.hstack([q[0], v[0]])[:: base.frame_skip])
+
+
+class Written(gym.Wrapper):
+    """Forces as a user's wrapper puts them on the hinges: once a step, for all of its substeps."""
+
+    def __init__(self, env, force):
+        super().__init__(env)
+        self.force = force
+
+    def step(self, action):
+        data = self.unwrapped.data
+        data.qfrc_applied[1:] = [self.force(v) for v in data.qvel[1:]]
+        return self.env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "force"),
+    [
+        ("held_friction", {"level": 0.2}, lambda v: -0.2 * np.sign(v)),
+        ("held_damping", {"coefficient": 0.1}, lambda v: -0.1 * v),
+        ("held_drag", {"coefficient": 0.05}, lambda v: -0.05 * abs(v) * v),
+    ],
+)
+@pytest.mark.parametrize("beside", [False, True])
+def test_held_forces_are_those_of_a_wrapper_that_writes_them(kind, values, force, beside):
+    bare = gym.make(POLE)
+    others = effects(bare.unwrapped.model) if beside else []  # forces in every substep among them
+    held = [LIBRARY[kind](hinge, **values) for hinge in ("hinge", "hinge2")]
+    actions = actions_for(bare, 40)
+    wrapped = CorrectedEnv(gym.make(POLE), [*others, *held])
+    written = Written(CorrectedEnv(gym.make(POLE), others), force)
+    for one, other in zip(run(wrapped, actions), run(written, actions)):
+        np.testing.assert_allclose(one[0], other[0], rtol=0, atol=1e-9)
 
 
 def test_each_effect_shows():

@@ -144,3 +144,48 @@ def test_a_log_tells_that_the_model_has_too_much(less: bool) -> None:
         assert traced.effect.values == pytest.approx([-0.035], rel=0.02)
         low, high = (bound[0] for bound in traced.interval)
         assert low < traced.effect.values[0] < high < 0
+
+
+class Braked(gym.Wrapper):
+    """A force against the motion of the cart, written once a step."""
+
+    def __init__(self, env: gym.Env, kind: str) -> None:
+        super().__init__(env)
+        self.kind = kind
+
+    def step(self, action: Any) -> Any:
+        data: Any = self.env.unwrapped.data  # type: ignore[attr-defined]
+        v = data.qvel[0]
+        data.qfrc_applied[0] = -2.0 * abs(v) * v if self.kind == "held_drag" else -8.0 * np.sign(v)
+        return self.env.step(action)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "value"), [("held_drag", 2.0), ("held_friction", 8.0)])
+def test_a_force_that_a_wrapper_writes_once_a_step_is_found_as_it_is_held(kind: str, value: float) -> None:
+    source = gym.make("InvertedDoublePendulum-v5")
+    report = trace(source, transitions(source, Braked(gym.make("InvertedDoublePendulum-v5"), kind)), threads=1)
+    assert report.verdict == "explained"
+    assert [traced.label for traced in report.effects] == [f"{kind}(slider)"]
+    assert report.effects[0].effect.values == pytest.approx([value], rel=1e-3)
+    assert [f.kind for f in report.findings].count("held forces") == 1
+    # The corrected environment is the target, in the middle of a step, too.
+    target = Braked(gym.make("InvertedDoublePendulum-v5"), kind)
+    corrected = report.apply(gym.make("InvertedDoublePendulum-v5"))
+    for env in (target, corrected):
+        env.reset(seed=3)
+    for action in (0.9, -0.7, 0.1):
+        seen = [env.step(np.array([action], dtype=np.float32))[0] for env in (target, corrected)]
+        np.testing.assert_allclose(*seen, rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_what_acts_in_every_substep_is_not_called_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = gym.make("InvertedDoublePendulum-v5")
+    target = apply_effects(
+        gym.make("InvertedDoublePendulum-v5"), [LIBRARY["quadratic_drag"]("slider", coefficient=2.0)]
+    )
+    monkeypatch.setattr(conclude, "share_left", lambda *_: pytest.fail("what was found explains all"))
+    report = trace(source, transitions(source, target), ["pole.length"], threads=1)
+    assert report.verdict == "explained"
+    assert [traced.label for traced in report.effects] == ["quadratic_drag(slider)"]

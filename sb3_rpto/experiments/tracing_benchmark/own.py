@@ -17,7 +17,7 @@ from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.sensors import ago
-from sb3_rpto.effects.simulation import prepare, push, pushing
+from sb3_rpto.effects.simulation import Push, prepare, pushing
 from sb3_rpto.effects.world import BatchWorld
 from sb3_rpto.experiments.planting import SYSTEMS, Link, System
 from sb3_rpto.experiments.planting.excitation import Excitation
@@ -190,7 +190,7 @@ def simulate(
     world.qpos[:, moved] = excitation.q + machine.rest
     rows = [(effect, np.tile(effect.values, (episodes, 1))) for effect in acting]
     prepare(world, rows)
-    forces = pushing(rows)
+    push = Push(world, pushing(rows))
     chain: list[tuple[Effect, np.ndarray, dict[str, Any]]]
     chain = [(e, x, {}) for e, x in sorted(rows, key=lambda row: row[0].order) if e.overrides("command")]
     sensors = [(e, x) for e, x in rows if e.senses]
@@ -215,11 +215,11 @@ def simulate(
         for j, link in enumerate(machine.system.links):
             if link.motor:
                 commands[:, k, motors.index(link.motor)] = u[:, j]
-        for _ in range(substeps):
+        for substep in range(substeps):
             world.ctrl[:] = commands[:, k]
             for effect, x, memory in chain:
                 world.ctrl[:, effect.ctrl] = effect.command(world.ctrl[:, effect.ctrl].copy(), x, memory, STEP)
-            push(world, forces)
+            push(begins=substep == 0)
             world.batch.step()
             past.append((world.qpos.copy(), world.qvel.copy()))
     if not np.isfinite(measured).all():
