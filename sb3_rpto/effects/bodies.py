@@ -202,6 +202,32 @@ class Wind(Effect):
 
 
 @register
+class ExternalForce(Effect):
+    r"""A constant force :math:`(x, y, z)` in the world's frame at a body's centre of mass: MuJoCo's ``xfrc_applied``.
+
+    What pulls or pushes a base that moves freely; at one that only slides or turns it is a ``torque_offset``.
+    """
+
+    kind = "external_force"
+    place = "body"
+    parameters = tuple(Parameter(axis, "N", lambda s: 0.3 * s.mass) for axis in "xyz")  # 3 % of a weight
+    equation = "(x, y, z) at the centre of mass"
+    excite = "poses at which the base turns differently"
+    offered = False
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Bodies in the world that move in two ways or more."""
+        names = object_names(model, "body")
+        base = (model.body_weldid[model.body_parentid] == 0) & (model.body_dofnum > 1)
+        return [name for name in super().places(model) if base[names.index(name)]]
+
+    def act(self, world: World, x: np.ndarray) -> None:
+        """Add the force."""
+        world.pull[:, self.index] += x
+
+
+@register
 class Fluid(Effect):
     r"""A medium that drags every body by its size: MuJoCo's ``option density`` and ``viscosity``.
 

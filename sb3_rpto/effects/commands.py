@@ -1,4 +1,4 @@
-"""What happens to a command on its way to the actuator, in order: smoothing, delay, deadband, saturation, play, lag.
+"""What happens to a command on its way to the actuator: offset, smoothing, delay, deadband, saturation, play, lag.
 
 A wrong gain comes last of all, in the actuator itself.
 """
@@ -15,6 +15,26 @@ from sb3_rpto.effects.world import World
 
 LONGEST_DELAY = 0.2  # s; a longer delay is a fault of the log
 _SLOWEST = 0.25  # s; of a slower lag the past that windows keep says too little
+
+
+@register
+class CommandOffset(Effect):
+    r"""A constant on top of every command, :math:`u + c`, within the actuator's ``ctrlrange``, where MuJoCo clips it.
+
+    Where nothing is clipped it is a ``torque_offset`` of the joint, which a noisy log hardly tells from it.
+    """
+
+    kind = "command_offset"
+    place = "actuator"
+    parameters = (Parameter("offset", "command", lambda s: 0.03 * s.command),)
+    equation = "u + offset"
+    excite = "small commands, and the largest ones"
+    offered = False
+    order = -2
+
+    def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:
+        """Add."""
+        return u + x[:, 0]
 
 
 @register

@@ -184,8 +184,7 @@ class Simulation:
                 world.batch.step()
                 out_q[:, k + 1], out_v[:, k + 1] = world.qpos, world.qvel
         else:
-            world.force[:] = 0
-            world.friction[:] = 0
+            world.force[:], world.pull[:], world.friction[:] = 0, 0, 0
             world.commit()
             record = world.batch.rollout(steps, commands, record=("qpos", "qvel"))
             out_q[:, 1:], out_v[:, 1:] = record["qpos"], record["qvel"]
@@ -286,7 +285,7 @@ class Push:
 
 def collect(world: World, acting: Active) -> None:
     """Collect the forces of one substep."""
-    world.force[:], world.friction[:], world.loss[:] = 0, 0, 0
+    world.force[:], world.pull[:], world.friction[:], world.loss[:] = 0, 0, 0, 0
     if any(effect.asks_simulator for effect, _ in acting):
         world.evaluate()
     for effect, x in acting:

@@ -38,6 +38,8 @@ class World(ABC):
         self.n = n
         self.force = np.zeros((n, model.nv))  # N·m or N, added to the generalised forces
         self.friction = np.zeros((n, model.nv))  # N·m or N, added to the level of dry friction
+        self.pull = np.zeros((n, model.nbody, 3))  # N, at the bodies' centres of mass, in the world's frame
+        self.pulls = False  # whether there was any since settle
         self.loss = np.zeros((n, model.nv))  # N·m or N, what motors do not give of their torques
         self._nominal: dict[str, np.ndarray] = {}
         self._base_friction: np.ndarray | None = None  # (n, nv), before the substep's own
@@ -68,7 +70,7 @@ class World(ABC):
         self._keep_friction()
 
     def _keep_friction(self) -> None:
-        self._dry[:] = False
+        self._dry[:] = self.pulls = False
         self._base_friction = None
         if "dof_frictionloss" in self._nominal:
             self._base_friction = self._live("dof_frictionloss").copy()
@@ -91,8 +93,11 @@ class World(ABC):
             self.field("dof_solimp")[where, dof] = (0.99, 0.99, 0.001, 0.5, 2.0)
 
     def commit(self) -> None:
-        """Write the collected ``force`` and ``friction`` to the physics."""
+        """Write the collected ``force``, ``pull`` and ``friction`` to the physics."""
         self._applied()[:] = self.force
+        if self.pulls or self.pull.any():
+            self.pulls = True
+            self._pulled()[:] = self.pull
         dry = self.friction.any(axis=0)
         if dry.any():
             if self._base_friction is None:
@@ -110,6 +115,10 @@ class World(ABC):
     @abstractmethod
     def _applied(self) -> np.ndarray:
         """The (n, nv) live qfrc_applied."""
+
+    @abstractmethod
+    def _pulled(self) -> np.ndarray:
+        """The (n, nbody, 3) live forces of xfrc_applied."""
 
 
 class BatchWorld(World):
@@ -157,6 +166,9 @@ class BatchWorld(World):
 
     def _applied(self) -> np.ndarray:
         return self.batch.bind("qfrc_applied")
+
+    def _pulled(self) -> np.ndarray:
+        return np.asarray(self.batch.bind("xfrc_applied")[:, :, :3])
 
 
 class LiveWorld(World):
@@ -209,3 +221,6 @@ class LiveWorld(World):
 
     def _applied(self) -> np.ndarray:
         return self.data.qfrc_applied[None]
+
+    def _pulled(self) -> np.ndarray:
+        return self.data.xfrc_applied[None, :, :3]

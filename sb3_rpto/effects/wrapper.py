@@ -226,7 +226,8 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             if effect.place == "joint":
                 world.rough(effect.dof)
         world.settle()
-        command, dt, others = np.array(ctrl, dtype=float), model.opt.timestep, data.qfrc_applied.copy()
+        command, dt = np.array(ctrl, dtype=float), model.opt.timestep
+        forces, pulls = data.qfrc_applied.copy(), data.xfrc_applied.copy()  # the environment's own
         ages = _ages([pair for layer in stack for pair in layer._sensing])
         kept = math.ceil(max(ages.values(), default=0.0) / dt) + 1
         if kept > 1 and not self._past:
@@ -239,14 +240,16 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             data.ctrl[:] = sent
             if acting:
                 push(begins=k == 0)
-                data.qfrc_applied += others
+                data.qfrc_applied += forces
+                if world.pulls:
+                    data.xfrc_applied[:, :3] += pulls[:, :3]
             mujoco.mj_step(model, data)
             if kept > 1:
                 self._past = [*self._past[1 - kept :], (data.qpos.copy(), data.qvel.copy())]
         if acting:
             # What a later set_state computes must not depend on the substep before it.
             world.restore()
-            data.qfrc_applied[:] = others
+            data.qfrc_applied[:], data.xfrc_applied[:] = forces, pulls
         mujoco.mj_rnePostConstraint(model, data)
         self._time = float(data.time)
 

@@ -59,6 +59,23 @@ STOPPED = mujoco.MjModel.from_xml_string("""
   <actuator><motor name="motor" joint="hinge" gear="12"/></actuator>
 </mujoco>""")
 
+#: A body that nothing holds; its centre of mass is not where its joint is.
+FLOATING = mujoco.MjModel.from_xml_string("""
+<mujoco>
+  <option timestep="0.004" gravity="0 0 0"/>
+  <worldbody>
+    <body name="base">
+      <freejoint name="free"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 -0.4" size="0.05"/>
+      <body name="arm" pos="0.2 0 -0.4">
+        <joint name="hinge" axis="0 1 0" damping="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge"/></actuator>
+</mujoco>""")
+
 #: One hinge of known inertia whose damping is integrated explicitly, so that a step shows the torque.
 HINGE = mujoco.MjModel.from_xml_string("""
 <mujoco>
@@ -158,6 +175,7 @@ ROWS = {
         {"inverse_stall": 0.1, "inverse_speed": 0.05},
         motor_limit,
     ),
+    "command_offset": Row("elbow_motor", {"offset": 0.2}, {"offset": 0.0}),
     "command_smoothing": Row("shoulder_motor", {"share": 0.6}, {"share": 0.2}),
     "command_delay": Row("shoulder_motor", {"delay": 0.026}, {"delay": 0.01}),
     "command_deadband": Row("elbow_motor", {"width": 0.1}, {"width": 0.02}),
@@ -170,6 +188,7 @@ ROWS = {
     "sensor_gain": Row("shoulder", {"change": 0.04}, {"change": 0.0}),
     "mass_scale": Row("lower", {"change": -0.25}, {"change": 0.0}),
     "payload": Row("lower", {"mass": 0.3, "along": 1.6}, {"mass": 0.1, "along": 1.0}),
+    "external_force": Row("base", {"x": 3.0, "y": -2.0, "z": 5.0}, {"x": 0.0, "y": 0.0, "z": 0.0}, model=FLOATING),
     "armature": Row("elbow", {"inertia": 0.02}, {"inertia": 0.005}),
     "link_length": Row("lower", {"change": 0.12}, {"change": 0.0}),
     "gravity_scale": Row("", {"change": -0.3}, {"change": 0.0}),

@@ -134,6 +134,8 @@ def from_library(kind, model):
 @pytest.mark.parametrize("kind", ["", *SHIPPED])
 def test_it_steps_as_the_batch_does(kind):
     env = gym.make(POLE)
+    if kind and not LIBRARY[kind].places(env.unwrapped.model):
+        env = gym.make("Reacher-v5")  # its target moves in two ways
     base = env.unwrapped
     base.model.opt.density, base.model.geom_contype[-1] = 1.2, 1  # for the wind and the friction of contacts
     mujoco.mj_setConst(base.model, mujoco.MjData(base.model))
@@ -141,7 +143,7 @@ def test_it_steps_as_the_batch_does(kind):
     chosen = from_library(kind, nominal) if kind else effects(nominal)
     wrapped = CorrectedEnv(env, chosen)
     wrapped.reset(seed=0)
-    qpos, qvel = np.array([0.1, 0.3, -0.4]), np.array([0.5, -1.0, 2.0])
+    qpos, qvel = np.array([0.1, 0.3, -0.4, 0.1])[: base.model.nq], np.array([0.5, -1.0, 2.0, 0.1])[: base.model.nv]
     mujoco.mj_resetData(base.model, base.data)
     base.data.qpos[:], base.data.qvel[:] = qpos, qvel
     actions = actions_for(env, 60)
@@ -186,6 +188,24 @@ def test_held_forces_are_those_of_a_wrapper_that_writes_them(kind, values, force
     written = Written(CorrectedEnv(gym.make(POLE), others), force)
     for one, other in zip(run(wrapped, actions), run(written, actions)):
         np.testing.assert_allclose(one[0], other[0], rtol=0, atol=1e-9)
+
+
+def test_an_external_force_is_xfrc_applied_at_the_centre_of_mass():
+    class Pulled(gym.Wrapper):
+        def step(self, action):
+            self.unwrapped.data.xfrc_applied[1, :3] = (5.0, 0.0, -2.0)
+            return self.env.step(action)
+
+    force = LIBRARY["external_force"]("torso", x=5.0, z=-2.0)
+    friction = LIBRARY["load_friction"]("foot_joint", mu=0.1)  # acts in every substep, too
+    actions = actions_for(gym.make("Hopper-v5"), 30)
+    effect = run(CorrectedEnv(gym.make("Hopper-v5"), [force, friction]), actions)
+    written = run(Pulled(CorrectedEnv(gym.make("Hopper-v5"), [friction])), actions)
+    beside = run(Pulled(CorrectedEnv(gym.make("Hopper-v5"), [force.with_values(-force.values), friction])), actions)
+    neither = run(CorrectedEnv(gym.make("Hopper-v5"), [friction]), actions)
+    for one, other in [*zip(effect, written), *zip(beside, neither)]:
+        np.testing.assert_allclose(one[0], other[0], rtol=0, atol=1e-9)
+    assert not np.allclose(effect[-1][0], neither[-1][0], atol=1e-3)
 
 
 def test_each_effect_shows():

@@ -189,3 +189,40 @@ def test_what_acts_in_every_substep_is_not_called_held(monkeypatch: pytest.Monke
     report = trace(source, transitions(source, target), ["pole.length"], threads=1)
     assert report.verdict == "explained"
     assert [traced.label for traced in report.effects] == ["quadratic_drag(slider)"]
+
+
+class Biased(gym.ActionWrapper):
+    """Adds to every action, beyond what the motor takes."""
+
+    def action(self, action: Any) -> Any:
+        return action + np.float32(0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["command_offset", "torque_offset"])
+def test_an_offset_of_the_commands_is_told_from_a_torque_by_those_that_are_clipped(kind: str) -> None:
+    source, target = gym.make("InvertedDoublePendulum-v5"), gym.make("InvertedDoublePendulum-v5")
+    target = Biased(target) if kind == "command_offset" else apply_effects(target, [LIBRARY[kind]("slider", offset=75)])
+    report = trace(source, transitions(source, target), ["pole.length"], threads=1)
+    assert report.verdict == "explained"
+    assert [traced.effect.kind for traced in report.effects] == [kind]
+    assert report.effects[0].effect.values == pytest.approx([0.15 if kind == "command_offset" else 75], rel=1e-3)
+
+
+class Pushed(gym.Wrapper):
+    """A wind on the torso."""
+
+    def step(self, action: Any) -> Any:
+        self.env.unwrapped.data.xfrc_applied[1, :3] = (12.0, 0.0, -5.0)  # type: ignore[attr-defined]
+        return self.env.step(action)
+
+
+@pytest.mark.slow
+def test_a_push_at_the_centre_of_mass_is_found_where_the_base_turns_about_another_point() -> None:
+    source, target = gym.make("HalfCheetah-v5"), Pushed(gym.make("HalfCheetah-v5"))
+    kinds = ["external_force", "torque_offset", "torque_ripple", "coulomb_friction", "gravity_tilt", "command_offset"]
+    report = trace(source, transitions(source, target), candidates=kinds, threads=1)
+    assert report.verdict == "explained"
+    assert [traced.label for traced in report.effects] == ["external_force(torso)"]
+    x, _, z = report.effects[0].effect.values  # nothing moves sideways
+    assert (x, z) == pytest.approx((12.0, -5.0), abs=0.01)
