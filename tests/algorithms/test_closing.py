@@ -121,6 +121,29 @@ def test_a_target_with_frictionloss_alone_is_explained(soon: None) -> None:
     assert dynamics(made).error(made.transitions("target")) < 1e-3, "the simulator gives way as the target does"
 
 
+class Braked(gym.Wrapper):
+    """Drag on the cart, written once a step."""
+
+    def step(self, action: Any) -> Any:
+        data: Any = self.env.unwrapped.data  # type: ignore[attr-defined]
+        data.qfrc_applied[0] = -2.0 * abs(data.qvel[0]) * data.qvel[0]
+        return self.env.step(action)
+
+
+@pytest.mark.slow
+def test_a_target_whose_wrapper_holds_a_force_for_a_step_is_met(soon: None, tmp_path: Path) -> None:
+    made = model([], target_env=Braked(target([])), close_loop=["held_drag", "quadratic_drag"])
+    made.learn(81, source_timesteps=4)
+    data = made.transitions("target")
+    values = dynamics(made).describe()
+    assert values["held_drag(slider).coefficient"] == pytest.approx(2.0, rel=1e-3)
+    assert "quadratic_drag(slider).coefficient" not in values
+    assert dynamics(made).error(data) < 1e-4, "one-step predictions hold it, too"
+    made.save(tmp_path / "held")
+    again = RPTO.load(tmp_path / "held", env=gym.make(TASK), target_env=Braked(target([])))
+    assert dynamics(again).error(data) == dynamics(made).error(data)
+
+
 @pytest.mark.slow
 def test_a_target_that_queues_actions_is_met_from_the_first_step_of_an_episode_on(soon: None, tmp_path: Path) -> None:
     made = model([], target_env=Queue(target([])), close_loop=["command_delay", "torque_offset"])
