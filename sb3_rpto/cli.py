@@ -131,12 +131,6 @@ def _add_trace(commands: Commands) -> None:
     parser.add_argument(
         "--threads", metavar="N", type=int, default=0, help="that simulate (default: one for each core)"
     )
-    parser.add_argument(
-        "--simulated",
-        action="store_true",
-        help="the recordings are of MODEL's own simulator, in its steps in time (default: found out; being told saves "
-        "a second search)",
-    )
     parser.add_argument("--quiet", action="store_true", help="no progress; print the verdict alone")
     parser.set_defaults(run=_trace)
 

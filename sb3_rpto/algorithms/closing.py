@@ -61,6 +61,9 @@ class LoopCloser:
     :param kinds: of effects to look for; True: all; none of them: the declared numbers alone are fitted
     """
 
+    #: called with each report, before the policy learns in what it corrects; no checkpoint holds it
+    on_report: Callable[[Report], None] | None = None
+
     def __init__(self, declared: tuple[str, ...], kinds: bool | Sequence[str] = True) -> None:
         self.declared, self.kinds = declared, kinds
         #: of this process; a checkpoint keeps what they said, :attr:`found`
@@ -71,8 +74,6 @@ class LoopCloser:
         self._error = math.inf
         #: called while it traces, as :func:`~sb3_rpto.tracing.trace.trace` calls it; no checkpoint holds it
         self.progress: Progress | None = None
-        #: called with each report, before the policy learns in what it corrects; no checkpoint holds it
-        self.on_report: Callable[[Report], None] | None = None
         #: whether the last transitions held too few windows to be traced
         self._untraced = False
         #: whether D_source holds what an uncorrected source produced, and the policy is to learn in the corrected one
@@ -91,7 +92,8 @@ class LoopCloser:
         self.rehearsals = Rehearsals()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "reports": [], "progress": None, "on_report": None}
+        kept = {name: value for name, value in vars(self).items() if name != "on_report"}
+        return {**kept, "reports": [], "progress": None}
 
     def forget_target(self) -> None:
         """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,7 @@ def run(parsed: argparse.Namespace) -> int:
                 "--known and --set dynamics_kwargs both give effects; give them all in the file of --known"
             )
         settings["dynamics_kwargs"] = {**own, "effects": effects}
-    data = recordings.read(parsed.files, parsed.format)
+    data = replace(recordings.read(parsed.files, parsed.format), simulated=parsed.simulated)
     config = {
         "command": "adapt",
         "env": world.name,
@@ -97,6 +98,7 @@ def run(parsed: argparse.Namespace) -> int:
         "steps": parsed.steps,
         "seed": parsed.seed,
         "settings": dict(parsed.set),
+        **({"simulated": True} if parsed.simulated else {}),  # runs of earlier versions do not tell
     }
     folder = RunFolder.open(parsed.out, config)
     if folder.result.exists():

@@ -39,6 +39,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="effects that the machine is known to have: the effects.json of an earlier trace of the same simulator",
     )
+    parser.add_argument(
+        "--simulated",
+        action="store_true",
+        help="the recordings are of the simulator itself, in its own steps in time (default: found out; being told "
+        "saves a second search)",
+    )
 
 
 def names(text: str) -> list[str]:

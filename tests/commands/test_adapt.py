@@ -14,6 +14,7 @@ import torch as th
 from stable_baselines3 import SAC
 
 from sb3_rpto import RPTO, cli
+from sb3_rpto.algorithms import closing
 from sb3_rpto.commands import enjoy
 from sb3_rpto.commands.progress import Progress
 from sb3_rpto.effects import LIBRARY
@@ -104,6 +105,16 @@ def test_its_folder_is_enjoyed_in_the_corrected_simulator(given: Path, tmp_path:
 
 
 @pytest.mark.slow
+def test_a_simulated_log_is_traced_as_one_where_that_is_said(given: Path, tmp_path: Path, monkeypatch) -> None:
+    found = []
+    monkeypatch.setattr(closing, "trace", lambda env, data, *args, **kwargs: found.append(data) or 1 / 0)
+    for options in ([], ["--simulated"]):
+        with pytest.raises(ZeroDivisionError):
+            adapt(given, tmp_path, *options)
+    assert [data.simulated for data in found] == [False, True]
+    assert json.loads((tmp_path / "config.json").read_text())["simulated"] is True
+
+
 def test_what_is_known_is_fitted_and_not_found_again(given: Path, tmp_path: Path) -> None:
     mass = {"kind": "declared", "on": "", "values": {"pole.mass": 5.5}}
     known = [mass, LIBRARY["torque_offset"]("hinge", offset=0.3).to_json()]
