@@ -9,7 +9,6 @@ from sb3_rpto.effects import LIBRARY, Declared
 from sb3_rpto.tracing.adequacy import SETTLED, TOLERANCE, judge
 from sb3_rpto.tracing.cautions import DRY, WORSE, creeping
 from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.holding import kinds_when_held, share_left
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.origin import may_be_exact, origin
 from sb3_rpto.tracing.prepare import Progress, SetUp
@@ -17,9 +16,11 @@ from sb3_rpto.tracing.search import Found
 from sb3_rpto.tracing.select import Selection
 from sb3_rpto.tracing.zeros import Zeros, homed, settled, zeros_by_run
 
-#: Dry friction that may give way, or forces that are held, are looked for where they leave less than this share of the
-#: error.
+#: Dry friction that may give way is looked for where it leaves less than this share of the error, and all kinds with
+#: forces that are held where those alone do.
 SOFTER = 0.5
+#: Kinds that brake a joint in every substep and have a held form.
+TWINS = ("coulomb_friction", "soft_friction", "viscous_friction", "asymmetric_damping", "quadratic_drag")
 SOFT = Finding(
     "soft friction",
     "fitted runs",
@@ -78,19 +79,21 @@ def conclude(
     """
 
     def read(data: Measurements, simulated: bool) -> tuple[SetUp, Found]:
-        set_up = prepared(data, simulated, kinds)
-        found = search(set_up)
-        for seems, others, said in (
-            (_creeps, _softer(kinds), SOFT),
-            (_holds, kinds_when_held(set_up.fitted.exact) if kinds is None else [], HELD),
-        ):
-            if others and not _explains(found) and seems(found):
-                other = prepared(data, simulated, others)
-                then = search(other)
-                if _explains(then) or then.after.ratio < found.after.ratio:
-                    other.findings.append(said)
-                    set_up, found = other, then
-        return set_up, found
+        def searched(kinds: Sequence[str] | None, said: Finding | None = None) -> tuple[SetUp, Found]:
+            set_up = prepared(data, simulated, kinds)
+            set_up.findings.extend([said] if said else [])
+            return set_up, search(set_up)
+
+        best, softer = searched(kinds), _softer(kinds)
+        if softer and not _explains(best[1]) and _creeps(best[1]):
+            best = _nearer(searched(softer, SOFT), best)
+        if kinds is None and not _explains(best[1]) and best[1].on.fine.train.windows.drive.hold > 1:
+            held = searched([kind for kind, effect in LIBRARY.items() if effect.held], HELD)
+            if _explains(held[1]):
+                best = held
+            elif held[1].after.ratio < SOFTER * best[1].after.ratio:  # there is more than that
+                best = _nearer(searched(_held(best[0].fitted.exact), HELD), best)
+        return best
 
     set_up, found = read(data, simulated)
     again = _of_own_steps(set_up, found, declared, threads)
@@ -130,10 +133,14 @@ def _creeps(found: Found) -> bool:
     return share < SOFTER or (share < 1 - WORSE and share * found.after.ratio <= 1 + TOLERANCE)
 
 
-def _holds(found: Found) -> bool:
-    """Whether friction, damping or drag that was found leaves what it would not if it were held for a step."""
-    model = found.selection.model
-    return share_left(found.on.fine.every_window(), model.fit.values, model.effects) < SOFTER
+def _nearer(one: tuple[SetUp, Found], other: tuple[SetUp, Found]) -> tuple[SetUp, Found]:
+    """One search if it explains, or comes nearer than the other."""
+    return one if _explains(one[1]) or one[1].after.ratio < other[1].after.ratio else other
+
+
+def _held(exact: bool) -> list[str]:
+    """The kinds that are looked for, with forces that are held in the place of their twins."""
+    return [kind for kind, e in LIBRARY.items() if e.held or ((e.offered or exact) and kind not in TWINS)]
 
 
 def _softer(kinds: Sequence[str] | None) -> list[str]:

@@ -180,12 +180,11 @@ def test_a_force_that_a_wrapper_writes_once_a_step_is_found_as_it_is_held(kind: 
 
 
 @pytest.mark.slow
-def test_what_acts_in_every_substep_is_not_called_held(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_acts_in_every_substep_is_not_called_held() -> None:
     source = gym.make("InvertedDoublePendulum-v5")
     target = apply_effects(
         gym.make("InvertedDoublePendulum-v5"), [LIBRARY["quadratic_drag"]("slider", coefficient=2.0)]
     )
-    monkeypatch.setattr(conclude, "share_left", lambda *_: pytest.fail("what was found explains all"))
     report = trace(source, transitions(source, target), ["pole.length"], threads=1)
     assert report.verdict == "explained"
     assert [traced.label for traced in report.effects] == ["quadratic_drag(slider)"]
