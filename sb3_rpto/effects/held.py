@@ -1,7 +1,7 @@
 """Forces that a wrapper puts on a joint: what they are at a step's beginning acts until its end.
 
 So does what is written to ``data.qfrc_applied`` before an environment steps, for all the substeps of that step. No
-machine does that: a trace looks for it where forces that were found in a simulator's states seem to be held
+machine does that: a trace looks for it where nothing else explains a simulator's states
 (:func:`sb3_rpto.tracing.conclude.conclude`).
 """
 
