@@ -96,7 +96,8 @@ class Effect:
     offered: ClassVar[bool] = True
     #: where in the chain of command effects it stands; smaller is nearer the controller. Of forces: smaller acts first
     order: ClassVar[int] = 0
-    #: whether what :meth:`act` collects at the beginning of a step of the environment acts until its end: forces alone
+    #: whether what :meth:`act` adds to ``world.force``, alone, at the beginning of a step of the environment acts until
+    #: its end
     held: ClassVar[bool] = False
     #: whether :meth:`act` reads ``world.actuation``, which costs an evaluation in every substep
     asks_simulator: bool = False

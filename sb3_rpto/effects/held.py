@@ -5,14 +5,13 @@ machine does that: a trace looks for it where nothing else explains a simulator'
 (:func:`sb3_rpto.tracing.conclude.conclude`).
 """
 
+from dataclasses import replace
+
 import numpy as np
 
-from sb3_rpto.effects.effect import Effect, Parameter, Scales, register
+from sb3_rpto.effects.effect import Effect, register
+from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, ViscousFriction
 from sb3_rpto.effects.world import World
-
-
-def _torque(scales: Scales) -> float:
-    return 0.03 * scales.torque
 
 
 class _Held(Effect):
@@ -29,7 +28,7 @@ class HeldFriction(_Held):
     """
 
     kind = "held_friction"
-    parameters = (Parameter("level", "N·m", _torque, lower=0.0),)
+    parameters = tuple(replace(p, own="") for p in CoulombFriction.parameters)  # it takes nothing of the model away
     equation = "-level sign(qd), held"
     excite = "motion that often reverses, at small and at large speed"
 
@@ -43,7 +42,7 @@ class HeldDamping(_Held):
     r"""A force :math:`-c\,\dot q`, written to MuJoCo's ``qfrc_applied`` at a step's beginning."""
 
     kind = "held_damping"
-    parameters = (Parameter("coefficient", "N·m·s/rad", lambda s: _torque(s) / s.velocity, lower=0.0),)
+    parameters = tuple(replace(p, own="") for p in ViscousFriction.parameters)
     equation = "-coefficient qd, held"
     excite = "motion at several speeds"
 
@@ -57,7 +56,7 @@ class HeldDrag(_Held):
     r"""Drag :math:`-c\,|\dot q|\,\dot q`, written to MuJoCo's ``qfrc_applied`` at a step's beginning."""
 
     kind = "held_drag"
-    parameters = (Parameter("coefficient", "N·m·s²/rad²", lambda s: _torque(s) / s.velocity**2, lower=0.0),)
+    parameters = QuadraticDrag.parameters
     equation = "-coefficient |qd| qd, held"
     excite = "fast motion"
 

@@ -67,9 +67,10 @@ class World(ABC):
         """Derive the constants that follow from the fields, and keep the level of dry friction."""
         if any(name in _DERIVING for name in self._nominal):
             self.derive()
-        self._keep_friction()
+        self._begin_to_act()
 
-    def _keep_friction(self) -> None:
+    def _begin_to_act(self) -> None:
+        """No effect has acted yet: keep the level of dry friction before one does."""
         self._dry[:] = self.pulls = False
         self._base_friction = None
         if "dof_frictionloss" in self._nominal:
@@ -146,7 +147,7 @@ class BatchWorld(World):
             # Of both: what followed here from the numbers of a rollout before must go, too.
             if any(world.batch.expanded(name) is not None for world in (few, self)):
                 self._live(name)[:] = few._live(name)[kind]
-        self._keep_friction()
+        self._begin_to_act()
 
     def derive(self) -> None:
         """As in :class:`World`; once for all simulations whose fields are alike, as many are in a fit."""

@@ -24,6 +24,7 @@ POINTS, BINS = 1200, 15
 #: What an effect answers to, where its place alone does not say it.
 CAUSES = {
     "spring": "position",
+    "end_stop": "position",
     "torque_ripple": "position",
     "position_friction": "position",
     "load_friction": "load",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from sb3_rpto.effects import LIBRARY, Declared
+from sb3_rpto.effects import LIBRARY, Declared, Effect
 from sb3_rpto.tracing.adequacy import SETTLED, TOLERANCE, judge
 from sb3_rpto.tracing.cautions import DRY, WORSE, creeping
 from sb3_rpto.tracing.checks import Finding
@@ -16,8 +16,8 @@ from sb3_rpto.tracing.search import Found
 from sb3_rpto.tracing.select import Selection
 from sb3_rpto.tracing.zeros import Zeros, homed, settled, zeros_by_run
 
-#: Dry friction that may give way is looked for where it leaves less than this share of the error, and all kinds with
-#: forces that are held where those alone do.
+#: Dry friction that may give way is looked for where it leaves less than this share of the error, and forces that are
+#: held are taken where they do, or explain.
 SOFTER = 0.5
 #: Kinds that brake a joint in every substep and have a held form.
 TWINS = ("coulomb_friction", "soft_friction", "viscous_friction", "asymmetric_damping", "quadratic_drag")
@@ -79,21 +79,23 @@ def conclude(
     """
 
     def read(data: Measurements, simulated: bool) -> tuple[SetUp, Found]:
-        def searched(kinds: Sequence[str] | None, said: Finding | None = None) -> tuple[SetUp, Found]:
+        def searched(kinds: Sequence[str] | None) -> tuple[SetUp, Found]:
             set_up = prepared(data, simulated, kinds)
-            set_up.findings.extend([said] if said else [])
             return set_up, search(set_up)
 
-        best, softer = searched(kinds), _softer(kinds)
-        if softer and not _explains(best[1]) and _creeps(best[1]):
-            best = _nearer(searched(softer, SOFT), best)
-        if kinds is None and not _explains(best[1]) and best[1].on.fine.train.windows.drive.hold > 1:
-            held = searched([kind for kind, effect in LIBRARY.items() if effect.held], HELD)
-            if _explains(held[1]):
-                best = held
-            elif held[1].after.ratio < SOFTER * best[1].after.ratio:  # there is more than that
-                best = _nearer(searched(_held(best[0].fitted.exact), HELD), best)
-        return best
+        (set_up, found), softer = searched(kinds), _softer(kinds)
+        if softer and not _explains(found) and _creeps(found):
+            other, then = searched(softer)
+            if _explains(then) or then.after.ratio < found.after.ratio:
+                set_up, found = other, then
+                set_up.findings.append(SOFT)
+        if kinds is None and not _explains(found) and found.on.fine.train.windows.drive.hold > 1:
+            other, then = searched(_held_beside(found))
+            if _explains(then) or then.after.ratio < SOFTER * found.after.ratio:
+                set_up, found = other, then
+                if any(effect.held for effect in _named(found)):
+                    set_up.findings.append(HELD)
+        return set_up, found
 
     set_up, found = read(data, simulated)
     again = _of_own_steps(set_up, found, declared, threads)
@@ -133,14 +135,14 @@ def _creeps(found: Found) -> bool:
     return share < SOFTER or (share < 1 - WORSE and share * found.after.ratio <= 1 + TOLERANCE)
 
 
-def _nearer(one: tuple[SetUp, Found], other: tuple[SetUp, Found]) -> tuple[SetUp, Found]:
-    """One search if it explains, or comes nearer than the other."""
-    return one if _explains(one[1]) or one[1].after.ratio < other[1].after.ratio else other
+def _named(found: Found) -> list[Effect]:
+    return [found.on.fine.simulation.effects[i] for i in found.selection.model.effects]
 
 
-def _held(exact: bool) -> list[str]:
-    """The kinds that are looked for, with forces that are held in the place of their twins."""
-    return [kind for kind, e in LIBRARY.items() if e.held or ((e.offered or exact) and kind not in TWINS)]
+def _held_beside(found: Found) -> list[str]:
+    """Kinds of forces that are held, and those that were found, but for what would be the same if it were held."""
+    there = {effect.kind for effect in _named(found)} - {*TWINS}
+    return [kind for kind, effect in LIBRARY.items() if effect.held or kind in there]
 
 
 def _softer(kinds: Sequence[str] | None) -> list[str]:

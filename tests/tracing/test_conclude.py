@@ -169,7 +169,7 @@ def test_a_force_that_a_wrapper_writes_once_a_step_is_found_as_it_is_held(kind: 
     assert [traced.label for traced in report.effects] == [f"{kind}(slider)"]
     assert report.effects[0].effect.values == pytest.approx([value], rel=1e-3)
     assert [f.kind for f in report.findings].count("held forces") == 1
-    # The corrected environment is the target, in the middle of a step, too.
+    # The corrected environment moves as the target does.
     target = Braked(gym.make("InvertedDoublePendulum-v5"), kind)
     corrected = report.apply(gym.make("InvertedDoublePendulum-v5"))
     for env in (target, corrected):
@@ -177,6 +177,17 @@ def test_a_force_that_a_wrapper_writes_once_a_step_is_found_as_it_is_held(kind: 
     for action in (0.9, -0.7, 0.1):
         seen = [env.step(np.array([action], dtype=np.float32))[0] for env in (target, corrected)]
         np.testing.assert_allclose(*seen, rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_held_force_is_found_beside_another_effect() -> None:
+    source = gym.make("InvertedDoublePendulum-v5")
+    weak = apply_effects(gym.make("InvertedDoublePendulum-v5"), [LIBRARY["command_gain"]("slide", change=-0.2)])
+    report = trace(source, transitions(source, Braked(weak, "held_drag")), threads=1)
+    assert report.verdict == "explained"
+    values = {traced.label: traced.effect.values[0] for traced in report.effects}
+    assert values == pytest.approx({"held_drag(slider)": 2.0, "command_gain(slide)": -0.2}, rel=1e-2)
+    assert [f.kind for f in report.findings].count("held forces") == 1
 
 
 @pytest.mark.slow
