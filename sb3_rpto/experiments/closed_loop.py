@@ -247,6 +247,7 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
         seed=job.seed,
         n_episodes=episodes,
         read=partial(_read, job.task, truth),
+        models=folder,
         **kwargs,
     )
     rows = [{**row, **{name: row[name] + spent for name, spent in before.items()}} for row in rows]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from stable_baselines3 import SAC
@@ -18,6 +19,7 @@ from sb3_rpto.algorithms.slbo import SLBO
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.experiments import baselines
 from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
+from sb3_rpto.experiments.phi_0 import fit_once
 from sb3_rpto.presets import resolve_preset
 
 
@@ -26,6 +28,7 @@ class Run:
     """What a method is given; see :func:`~sb3_rpto.experiments.run.transfer`.
 
     :param device: to learn on; runs side by side are quickest on the CPU
+    :param models: folder where fits of networks to the source are kept, for the runs that begin alike
     """
 
     source_model: str
@@ -37,6 +40,7 @@ class Run:
     source_data: str | None = None
     kwargs: dict[str, Any] = field(default_factory=dict)
     device: str = "cpu"
+    models: Path | None = None
 
     def source_id(self) -> str | None:
         """The source's id, None where it has none."""
@@ -75,6 +79,8 @@ def two_worlds(cls: type[TransferAlgorithm], run: Run, curve: LearningCurve) -> 
     source, kwargs = make_vec_env(run.make_source, n_envs=run.n_source_envs), dict(run.kwargs)
     kwargs["source_data"] = run.source_data
     model = cls.from_source(run.source_model, source, run.make_target(), seed=run.seed, device=run.device, **kwargs)
+    if run.models is not None:
+        fit_once(model, run.models)
     model.learn(run.budget, callback=curve)
 
 

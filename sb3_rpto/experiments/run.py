@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from pathlib import Path
 from typing import Any
 
 from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
@@ -24,6 +25,7 @@ def transfer(
     n_source_envs: int = 1,
     source_data: str | None = None,
     read: Callable[[Any], dict[str, Any]] | None = None,
+    models: Path | None = None,
     **kwargs: Any,
 ) -> list[dict[str, Any]]:
     """Run one method once.
@@ -39,6 +41,7 @@ def transfer(
     :param n_source_envs: source environments that step side by side
     :param source_data: transitions of the source, for the methods that use some (phi_0, cloning, mixed batches)
     :param read: further values of a row
+    :param models: folder where fits of networks to the source are kept, for the runs that begin alike
     :param kwargs: arguments of the method: of its constructor, or see :mod:`~sb3_rpto.experiments.methods`
     :return: one row an evaluation: method, seed, steps, return, updates, source_steps, seconds
     """
@@ -46,6 +49,8 @@ def transfer(
         raise ValueError(f"method={method!r} does not exist; choose one of {METHODS}")
     chosen = REGISTRY[method]
     curve = LearningCurve(make_target, every, n_episodes, seed, read, after_update=chosen.in_batches)
-    chosen.run(Run(source_model, make_source, make_target, budget, seed, n_source_envs, source_data, kwargs), curve)
+    worlds = make_source, make_target
+    given = Run(source_model, *worlds, budget, seed, n_source_envs, source_data, kwargs, models=models)
+    chosen.run(given, curve)
     curve.env.close()
     return [{"method": method, "seed": seed, **row} for row in curve.rows]

@@ -337,6 +337,8 @@ def learning_curve(task: Task, arguments: dict[str, Any] | None = None) -> list[
     method = {**REGISTRY, **ABLATED}[job.method]
     curve = LearningCurve(make_target, job.points, job.episodes, job.seed, read, after_update=method.in_batches)
     settings = copy.deepcopy(dict(job.settings))  # SAC writes into its policy_kwargs
-    method.run(Run(task.agent, make_source, make_target, job.points[-1], job.seed, 1, task.data, settings), curve)
+    models = Path(task.folder).with_name("sources")
+    given = Run(task.agent, make_source, make_target, job.points[-1], job.seed, 1, task.data, settings, models=models)
+    method.run(given, curve)
     curve.env.close()
     return curve.rows

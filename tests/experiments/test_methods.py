@@ -19,7 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_rpto.buffers import chronological
 from sb3_rpto.effects import declare
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.experiments import baselines
+from sb3_rpto.experiments import baselines, phi_0
 from sb3_rpto.experiments.curve import LearningCurve
 from sb3_rpto.experiments.methods import REGISTRY, Run
 from sb3_rpto.experiments.run import METHODS, transfer
@@ -147,13 +147,55 @@ def test_updates_and_source_steps_are_counted(source_model: str) -> None:
     assert last["trpo-warm"]["source_steps"] == 300
 
 
-def test_given_source_data_cost_no_source_steps(source_model: str, tmp_path: Path) -> None:
+@pytest.fixture
+def source_data(source_model: str, tmp_path_factory: pytest.TempPathFactory) -> str:
     data, spent = baselines.source_transitions(source_model, cartpole(), 0)
     assert spent == len(data["rewards"]) == 300
     names = {"obs": "observations", "act": "actions", "next_obs": "next_observations", "rew": "rewards"}
-    np.savez(tmp_path / "d.npz", done=data["terminations"], **{short: data[name] for short, name in names.items()})
-    rows = run("sac-mixed", source_model, source_data=str(tmp_path / "d.npz"))
+    path = tmp_path_factory.mktemp("data") / "d.npz"
+    np.savez(path, done=data["terminations"], **{short: data[name] for short, name in names.items()})
+    return str(path)
+
+
+def test_given_source_data_cost_no_source_steps(source_model: str, source_data: str) -> None:
+    rows = run("sac-mixed", source_model, source_data=source_data)
     assert [row["source_steps"] for row in rows] == [0] * 4
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("method", ["rpto", *(pytest.param(m, marks=pytest.mark.slow) for m in ("slbo", "ptp"))])
+def test_phi_0_is_fitted_once_and_is_what_a_run_fits_by_itself(
+    method: str, source_model: str, source_data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(phi_0, "commit", lambda: "abc")
+
+    def returns(**kwargs: Any) -> list[tuple[float, ...]]:
+        rows = run(method, source_model, source_data=source_data, **kwargs)
+        return [(row["return"], row["updates"], row["source_steps"]) for row in rows]
+
+    alone, first, again = returns(), returns(models=tmp_path), returns(models=tmp_path)
+    assert alone == first == again
+    (kept,) = tmp_path.iterdir()
+    before = kept.stat().st_mtime_ns
+    returns(models=tmp_path)
+    assert kept.stat().st_mtime_ns == before
+    returns(models=tmp_path, seed=4)
+    monkeypatch.setattr(phi_0, "commit", lambda: "abd")
+    returns(models=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 3  # another seed and another commit have fits of their own
+    monkeypatch.setattr(phi_0, "commit", lambda: "abd-dirty")
+    returns(models=tmp_path, seed=5)
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_what_fits_no_networks_to_recorded_steps_keeps_none(
+    source_model: str, source_data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(phi_0, "commit", lambda: "abc")
+    run("rpo", source_model, source_data=source_data, models=tmp_path)
+    run("rpto", source_model, models=tmp_path)  # which collects its steps in learn()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_mixed_sac_draws_half_of_each_world(source_model: str) -> None:
