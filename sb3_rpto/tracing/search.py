@@ -16,6 +16,7 @@ from sb3_rpto.tracing.kinds import few_kinds
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.screen import Screening, screen
 from sb3_rpto.tracing.select import INSTEAD, SEEMS, Model, Selection, Selector
+from sb3_rpto.tracing.stops import with_stops
 
 #: Declared parameters are fitted from so many starts.
 STARTS = 3
@@ -83,7 +84,11 @@ def find(
     closer = closely(on, base, before, finer, seed)
     if closer[2].adequate:
         on, base, before = closer
-        return Found(on, base, before, None, Selection(base), before)
+        selection = with_stops(on.fine, Selection(base))
+        if not selection.model.effects:
+            return Found(on, base, before, None, selection, before)
+        screening = screen(on.fine.train, within_bounds(on.fine.train, base.fit))
+        return Found(on, base, before, screening, selection, judged(on.fine, selection.model, seed))
     on = aligned(on, base.fit.values)
     on.say(0.15, "screening the candidates")
     screening = screen(on.fine.train, within_bounds(on.fine.train, base.fit))
@@ -105,6 +110,9 @@ def find(
     if then is not on:
         on, base = then, then.fine.model((), base.fit, iterations=10)
         before = judged(on.fine, base, seed)
+    stopped = with_stops(on.fine, selection)
+    if stopped is not selection:
+        selection, after = stopped, judged(on.fine, stopped.model, seed)
     return Found(on, base, before, screening, selection, after)
 
 
@@ -208,8 +216,9 @@ def search(on: Selectors, base: Model, screening: Screening, seed: int = 0) -> S
     """Looks for few kinds and for single effects, joint fit of all candidates, elimination, substitution by like ones.
 
     The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there.
-    Where a few kinds or single effects meet exact data, nothing else is needed. One kind is looked for in measured data
-    too, where contacts hold larger fits in kinks and the declared parameters alone are far from the noise.
+    Where stops of joints, a few kinds or single effects meet exact data, nothing else is needed. One kind is looked
+    for in measured data too, where contacts hold larger fits in kinks and the declared parameters alone are far from
+    the noise.
 
     Where the joint fit ends far from the noise and no nearer than the declared parameters alone, or worse than those,
     the best few kinds at all their places take its place, and where they do no better either, effects are added one by
@@ -222,6 +231,9 @@ def search(on: Selectors, base: Model, screening: Screening, seed: int = 0) -> S
     """
     rough, looked_at = on.rough, worth_a_look(on.fine, screening)
     alone = rough.model((), base.fit)
+    stopped = with_stops(rough, Selection(alone))
+    if rough.met(stopped.model):
+        return stopped
     if rough.train.exact or (rough.train.touching and rough.far(alone)):
         on.say(0.2, "looking for a few kinds")
         one = few_kinds(rough, screening, alone.fit)
