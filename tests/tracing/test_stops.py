@@ -1,5 +1,6 @@
 """Stops of joints that a target has elsewhere, in the states of a simulator."""
 
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -8,10 +9,19 @@ import pytest
 from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_rpto.effects import LIBRARY
+from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.tracing import Measurements, Report, trace
 
 
-def traced(env_id: str, declared: list[str], steps: int, wrap: Any = lambda env: env, **ranges: Any) -> Report:
+def traced(
+    env_id: str,
+    declared: list[str],
+    steps: int,
+    wrap: Any = lambda env: env,
+    kinds: list[str] | None = None,
+    **ranges: Any,
+) -> Report:
     """What random transitions of an environment tell whose joints have other ranges."""
     source, target = gym.make(env_id), gym.make(env_id)
     for joint, limits in ranges.items():
@@ -19,7 +29,7 @@ def traced(env_id: str, declared: list[str], steps: int, wrap: Any = lambda env:
     target = Monitor(wrap(target))
     agent = SAC("MlpPolicy", target, buffer_size=steps, learning_starts=steps, seed=0, device="cpu").learn(steps)
     assert agent.replay_buffer is not None
-    return trace(source, Measurements.from_replay(agent.replay_buffer, source), declared, threads=1)
+    return trace(source, Measurements.from_replay(agent.replay_buffer, source), declared, candidates=kinds, threads=1)
 
 
 def test_stops_that_few_windows_reach_are_found() -> None:
@@ -40,16 +50,15 @@ def test_stops_that_few_windows_reach_are_found() -> None:
 
 @pytest.mark.slow
 def test_stops_are_found_beside_another_effect() -> None:
-    class Weak(gym.ActionWrapper):
-        def action(self, action: Any) -> Any:
-            return 0.7 * action
-
-    report = traced("Swimmer-v5", ["torso.length"], 300, Weak, motor2_rot=(-0.8, 0.9))
+    drag = partial(apply_effects, effects=[LIBRARY["quadratic_drag"]("motor1_rot", coefficient=0.3)])
+    kinds = ["end_stop", "quadratic_drag", "coulomb_friction", "torque_offset"]
+    report = traced("Swimmer-v5", ["torso.length"], 300, drag, kinds, motor2_rot=(-0.8, 0.9))
     assert report.verdict == "explained"
-    assert sorted(effect.effect.kind for effect in report.effects) == ["command_gain", "command_gain", "end_stop"]
-    (stop,) = (effect.effect for effect in report.effects if effect.effect.kind == "end_stop")
+    found = {effect.label: effect.effect.values for effect in report.effects}
+    assert set(found) == {"end_stop(motor2_rot)", "quadratic_drag(motor1_rot)"}
     low, high = gym.make("Swimmer-v5").unwrapped.model.joint("motor2_rot").range  # type: ignore[attr-defined]
-    assert stop.values == pytest.approx([-0.8 - low, 0.9 - high], abs=1e-3)
+    assert found["end_stop(motor2_rot)"] == pytest.approx([-0.8 - low, 0.9 - high], abs=1e-3)
+    assert found["quadratic_drag(motor1_rot)"] == pytest.approx([0.3], rel=1e-3)
 
 
 @pytest.mark.slow
