@@ -32,8 +32,7 @@ def with_stops(selector: Selector, selection: Selection) -> Selection:
         model = more
     if model is selection.model:
         return selection
-    model, evidence = _needed(selector, model)
-    return replace(selection, model=model, evidence=evidence)
+    return _needed(selector, replace(selection, model=model))
 
 
 def _one_more(selector: Selector, model: Model) -> Model | None:
@@ -71,17 +70,19 @@ def _beginnings(problem: Problem, values: np.ndarray, effect: int) -> Iterator[t
             yield stop, [np.r_[values[:stop], m, values[stop + 1 :]] for m in moved]
 
 
-def _needed(selector: Selector, model: Model) -> tuple[Model, dict[int, Evidence]]:
-    """The model without the effects that are not clearly needed, and the evidence for the others."""
-    evidence = {}
+def _needed(selector: Selector, selection: Selection) -> Selection:
+    """The same without the effects that are not clearly needed, with the evidence for the others."""
+    model, evidence = selection.model, dict[int, Evidence]()
     for e in model.effects:
         without = selector.model([i for i in model.effects if i != e], model.fit)
         evidence[e] = compare(without.errors, model.errors, selector.blocks, rare=True)
         # What meets exact data in every window needs no more blocks to speak for it.
         met = selector.met(model) and not selector.met(without)
         if not met and not evidence[e].clear(*selector.limit(model)):
-            return _needed(selector, without)
-    return model, evidence
+            dropped = {**selection.dropped, e: (0, evidence[e])}
+            return _needed(selector, replace(selection, model=without, dropped=dropped))
+    alike = {e: others for e, others in selection.alike.items() if e in model.effects}
+    return replace(selection, alike=alike, evidence=evidence)
 
 
 def _typical(errors: np.ndarray) -> float:
