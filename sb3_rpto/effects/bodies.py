@@ -70,6 +70,38 @@ class Payload(Effect):
 
 
 @register
+class ComOffset(Effect):
+    r"""A centre of mass elsewhere, :math:`c' = c + (x, y, z)` in the body's frame: MuJoCo's ``inertial pos``.
+
+    Mass, and the inertia about the centre, stay. What a body cannot move along does not show there: of a planar robot
+    two of the three numbers do.
+    """
+
+    kind = "com_offset"
+    place = "body"
+    parameters = tuple(Parameter(axis, "m", 0.01) for axis in "xyz")
+    equation = "centre of mass + (x, y, z)"
+    native = "inertial"
+    excite = "accelerations, and poses at which gravity pulls"
+    offered = False
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Moving bodies but those of MuJoCo's simplified form, which keeps the centre where it is."""
+        names = object_names(model, "body")
+        return [name for name in super().places(model) if not model.body_simple[names.index(name)]]
+
+    def why_not(self, model: mujoco.MjModel) -> str:
+        """As in :class:`Effect`."""
+        moves = self.on in super().places(model)
+        return "MuJoCo holds it in a form that keeps the centre where it is" if moves else super().why_not(model)
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Move the centre of mass."""
+        world.field("body_ipos")[:, self.index] += x
+
+
+@register
 class Armature(Effect):
     r"""Inertia of a motor's rotor behind its gear, :math:`-a\,\ddot q`: MuJoCo's ``armature``."""
 

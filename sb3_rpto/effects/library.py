@@ -37,8 +37,8 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
     link_length(arm), a geom's ``friction`` geom_friction, an actuator's ``gain``, ``gear`` or ``strength``
     command_gain, ``option.density`` and ``option.viscosity`` fluid. A declared mass leaves payload in: it moves the
     centre of mass too.
-    soft_friction, held forces and gravity_scale, which no machine has, mass_scale, external_force, command_offset and
-    command_smoothing are left out unless they are named.
+    soft_friction, held forces and gravity_scale, which no machine has, mass_scale, com_offset, external_force,
+    command_offset and command_smoothing are left out unless they are named.
 
     :param model: the compiled model
     :param exclude: names of declared parameters, as :func:`~sb3_rpto.effects.declare` takes them

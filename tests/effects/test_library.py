@@ -188,6 +188,7 @@ ROWS = {
     "sensor_gain": Row("shoulder", {"change": 0.04}, {"change": 0.0}),
     "mass_scale": Row("lower", {"change": -0.25}, {"change": 0.0}),
     "payload": Row("lower", {"mass": 0.3, "along": 1.6}, {"mass": 0.1, "along": 1.0}),
+    "com_offset": Row("base", {"x": 0.03, "y": -0.02, "z": 0.05}, {"x": 0.0, "y": 0.0, "z": 0.0}, model=FLOATING),
     "external_force": Row("base", {"x": 3.0, "y": -2.0, "z": 5.0}, {"x": 0.0, "y": 0.0, "z": 0.0}, model=FLOATING),
     "armature": Row("elbow", {"inertia": 0.02}, {"inertia": 0.005}),
     "link_length": Row("lower", {"change": 0.12}, {"change": 0.0}),
@@ -470,7 +471,12 @@ def test_world_effects_are_mujocos_own() -> None:
     def fluid(m: mujoco.MjModel) -> None:
         m.opt.density, m.opt.viscosity = m.opt.density + 100, m.opt.viscosity + 0.3
 
+    def centre(m: mujoco.MjModel) -> None:
+        m.body_ipos[2] += (0.02, 0.0, -0.1)
+        mujoco.mj_setConst(m, mujoco.MjData(m))
+
     for effect, change in (
+        (LIBRARY["com_offset"]("lower", x=0.02, z=-0.1), centre),
         (LIBRARY["armature"]("elbow", inertia=0.02), armature),
         (LIBRARY["wind"](x=2.0, y=-1.0, z=0.5), wind),
         (LIBRARY["fluid"](density=100, viscosity=0.3), fluid),

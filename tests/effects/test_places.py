@@ -170,12 +170,20 @@ MUSCLE = """<mujoco><worldbody><body><freejoint name="root"/><geom size=".1"/>
         ("command_gain", "m", "actuator 'm': it can on none"),
         ("torque_ripple", "s", "joint 's': it can on h"),
         ("payload", "world", "body 'world': it can on"),
+        ("com_offset", "world", "body 'world': it can on"),
     ],
 )
 def test_an_effect_where_it_makes_no_sense_is_refused(kind: str, on: str, said: str) -> None:
     model = mujoco.MjModel.from_xml_string(MUSCLE)
     with pytest.raises(ValueError, match=f"{kind} cannot sit on {said}"):
         Simulation(model, [LIBRARY[kind](on)], 1)
+
+
+def test_the_centre_of_mass_of_a_body_that_mujoco_simplifies_is_refused() -> None:
+    model = gym.make("Reacher-v5").unwrapped.model
+    assert "target" not in {effect.on for effect in candidates(model, kinds={"com_offset"})}
+    with pytest.raises(ValueError, match="com_offset cannot sit on body 'target': MuJoCo holds it in a form"):
+        Simulation(model, [LIBRARY["com_offset"]("target", x=0.1)], 1)
 
 
 def test_delays_of_one_sensor_add_up() -> None:
