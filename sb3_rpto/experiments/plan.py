@@ -99,6 +99,11 @@ class Job:
         return json.loads(json.dumps(values))
 
 
+def variant_of(job: Mapping[str, Any]) -> dict[str, Any]:
+    """What all runs of a line of the tables agree in, of a job as :meth:`Job.to_json` gives it."""
+    return {name: value for name, value in job.items() if name not in ("target", "seed")}
+
+
 def jobs(suite: Suite, seeds: int | None = None, only: str | None = None) -> list[Job]:
     """All runs, in an order in which an unfinished suite is a fair sample.
 

@@ -26,7 +26,7 @@ from sb3_rpto.envs.tasks import env_id, make_shift
 from sb3_rpto.experiments.ablation import ABLATED
 from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
 from sb3_rpto.experiments.methods import REGISTRY, Run
-from sb3_rpto.experiments.plan import Job, Place, Suite, jobs, listing
+from sb3_rpto.experiments.plan import Job, Place, Suite, jobs, listing, variant_of
 from sb3_rpto.experiments.provenance import commit, constructor_arguments, machine, plain, versions
 from sb3_rpto.experiments.sources import Reference, digest, reference, source_agent
 from sb3_rpto.experiments.suites import SUITES
@@ -159,10 +159,12 @@ def _prepared(what: str, answers: Iterator[tuple[str, Answer]], count: int) -> d
 
 def _about(suite: Suite, seeds: int | None) -> dict[str, Any]:
     """What the report has to know of a suite."""
+    variants = [variant_of(job.to_json()) for job in jobs(suite, 1)]
     return {
         "suite": suite.name,
         "about": suite.about,
         "labels": list(dict.fromkeys(variant.label for place in suite.places for variant in place.variants)),
+        "variants": [variant for i, variant in enumerate(variants) if variant not in variants[:i]],
         "interactions": [list(pair) for pair in suite.interactions],
         "planned": len(jobs(suite, seeds)),
     }

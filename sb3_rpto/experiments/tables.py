@@ -15,6 +15,7 @@ from typing import Any
 import pandas as pd
 
 from sb3_rpto.experiments import plots
+from sb3_rpto.experiments.plan import variant_of
 from sb3_rpto.experiments.report import (
     PLACE,
     SHARE,
@@ -42,14 +43,14 @@ class Study:
     :param rows: one line a run and evaluation: task, target, label, method, seed, steps, return, score, updates,
         source_steps, seconds, factors; model_error where a model was learned
     :param failed: name and last line of the error of each run that failed
-    :param left_out: runs of another source agent than the references'
+    :param left_out: name of each run that is not of the suite as it is now, and why
     :param commits: of the runs
     """
 
     manifest: dict[str, Any]
     rows: pd.DataFrame
     failed: dict[str, str]
-    left_out: list[str]
+    left_out: dict[str, str]
     commits: list[str]
 
     @property
@@ -94,7 +95,8 @@ def load(folder: str | os.PathLike[str]) -> Study:
             f"{path} is torn ({error}); run 'sb3-rpto benchmark transfer' again with that --out"
         ) from error
     rows: list[dict[str, Any]] = []
-    failed, left_out, commits = {}, [], set()
+    failed, left_out, commits = dict[str, str](), dict[str, str](), set[str]()
+    variants = manifest.get("variants")  # folders of earlier versions do not tell
     for file in sorted((Path(folder) / "runs").glob("*.json")):
         try:
             result = json.loads(file.read_text(encoding="utf-8"))
@@ -106,7 +108,9 @@ def load(folder: str | os.PathLike[str]) -> Study:
         if result["error"]:
             failed[result["name"]] = result["error"].strip().splitlines()[-1]
         elif result["source"]["sha256"] != reference.get("agent"):
-            left_out.append(result["name"])
+            left_out[result["name"]] = "of another source agent"
+        elif variants is not None and variant_of(job) not in variants:
+            left_out[result["name"]] = "of other settings than the suite's"
         else:
             commits.add(str(result["commit"]))
             known = {name: job[name] for name in ("task", "target", "label", "method", "seed", "factors")}
@@ -174,7 +178,7 @@ def markdown(study: Study, tables: Mapping[str, pd.DataFrame]) -> str:
     if study.failed:
         parts.append("Failed: " + "; ".join(f"{name} ({why})" for name, why in study.failed.items()) + ".")
     if study.left_out:
-        parts.append(f"Left out, of another source agent: {', '.join(study.left_out)}.")
+        parts.append("Left out: " + "; ".join(f"{name} ({why})" for name, why in study.left_out.items()) + ".")
     parts += ["## References", _references(references)]
     if "effects" in tables:
         parts += ["## Factors", _effects(tables["effects"])]

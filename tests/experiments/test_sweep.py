@@ -23,7 +23,7 @@ from tiny_suite import PLACE, SUITE, returns, run_here, stored
 from sb3_rpto import RPTO, cli
 from sb3_rpto.algorithms.slbo import SLBO
 from sb3_rpto.buffers import load_transitions
-from sb3_rpto.experiments import sources, sweep
+from sb3_rpto.experiments import sources, sweep, tables
 from sb3_rpto.experiments.plan import Place, Variant, jobs
 from sb3_rpto.experiments.provenance import constructor_arguments
 from sb3_rpto.experiments.suites import SMOKE, SUITES
@@ -85,6 +85,8 @@ def test_finished_runs_are_not_repeated_and_torn_failed_or_other_ones_are(tmp_pa
     longer = replace(SUITE, places=(replace(PLACE, points=(10, 30), oracle_steps=PLACE.oracle_steps),))
     sweep.run(longer, tmp_path, workers=1, only="sac-warm_1")
     assert worked == ["ContinuousCartPole_limb-x2_sac-warm_1"]
+    made_before = {file.stem for file in (tmp_path / "runs").glob("*.json")} - {*worked}
+    assert set(tables.load(tmp_path).left_out) == made_before  # the suite had other points then
 
 
 @pytest.mark.parametrize("suite", ["quick", "ablation", "further"])

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from sb3_rpto import cli
-from sb3_rpto.experiments import report, tables
+from sb3_rpto.experiments import plan, report, tables
 from sb3_rpto.experiments.plots import learning_curves
 
 # --- statistics -----------------------------------------------------------------------------------------------------
@@ -220,7 +220,20 @@ def test_what_does_not_count_is_said(folder: Path) -> None:
     text = tables.write(folder)
     assert "8 of 10 runs are done" in text
     assert "Ant_target1_sac-warm_6 (ValueError: NaN); Ant_target1_sac-warm_7 (torn file)" in text
-    assert "Left out, of another source agent: Hopper_target0_sac-warm_5." in text
+    assert "Left out: Hopper_target0_sac-warm_5 (of another source agent)." in text
+
+
+def test_runs_of_settings_that_the_suite_had_before_are_left_out(folder: Path) -> None:
+    made = {file: json.loads(file.read_text()) for file in (folder / "runs").glob("*.json")}
+    assert len(tables.load(folder).left_out) == 0
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["variants"] = [plan.variant_of(result["job"]) for result in made.values()]
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    assert len(tables.load(folder).left_out) == 0
+    file = next(file for file in made if made[file]["job"]["seed"] == 0 and made[file]["job"]["method"] == "sac-warm")
+    made[file]["job"]["settings"] = {"learning_rate": 0.01}
+    file.write_text(json.dumps(made[file]))
+    assert tables.load(folder).left_out == {made[file]["name"]: "of other settings than the suite's"}
 
 
 def test_a_single_run_has_no_interval(folder: Path) -> None:
