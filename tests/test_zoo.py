@@ -261,6 +261,13 @@ def test_a_source_agent_brings_its_settings_along(zoo, agent, tmp_path):
     assert SOURCE in saved
 
 
+def test_an_agent_of_another_task_is_refused_in_a_line(zoo, agent, tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        launch(tmp_path, "rpo", "--source-model", str(agent), *SMALL, env="rpto/InvertedDoublePendulum-target0-v0")
+    assert "error: --source-model: source_model has observation_space" in capsys.readouterr().err
+    assert not any(tmp_path.glob("rpo/*"))
+
+
 def test_another_factor_is_a_target_too(zoo, agent, tmp_path):
     source = ["--source-model", str(agent), "-n", "4", "--eval-freq", "2", "--eval-episodes", "1"]
     run = launch(tmp_path, "rpo", *source, "--eval-env-kwargs", "shift:'limb-x3'", *SMALL, env=SOURCE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
+import sys
 import warnings
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_rpto.algorithms.bookkeeping import TARGET_SEED_OFFSET
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
-from sb3_rpto.algorithms.warm import carried_arguments, load_sac
+from sb3_rpto.algorithms.warm import carried_arguments, check_source_spaces, load_sac
 from sb3_rpto.zoo.samplers import SAMPLERS
 from sb3_rpto.zoo.settings import ALGORITHMS, section, shipped_file, source_of
 
@@ -283,13 +284,19 @@ class TransferManager(ExperimentManager):
         :param source: to train in
         :param target: to train in
         :param settings: further constructor arguments
+        :raises SystemExit: code 2, and a line of what is wrong with the source agent
         """
         common = {"tensorboard_log": self.tensorboard_log, "verbose": self.verbose, "device": self.device}
         settings = {**hyperparams, **common, **settings, "target_env": target}
         cls = ALGORITHMS[self.algo]
         if start.source_model is None:
             return cls(env=source, **settings)
-        sac = load_sac(start.source_model, self.device)
+        try:
+            sac = load_sac(start.source_model, self.device)
+            check_source_spaces(sac, source)
+        except ValueError as error:
+            print(f"sb3_rpto.zoo.train: error: --source-model: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
         brought = {"policy"} | carried_arguments(sac).keys() - set(asked)
         settings = {name: value for name, value in settings.items() if name not in brought}
         return cls.from_source(sac, source, source_data=start.source_data, **settings)
