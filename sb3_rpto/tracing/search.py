@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -213,10 +213,10 @@ def worth_a_look(selector: Selector, screening: Screening) -> list[int]:
 
 
 def search(on: Selectors, base: Model, screening: Screening, seed: int = 0) -> Selection:
-    """Looks for few kinds and for single effects, joint fit of all candidates, elimination, substitution by like ones.
+    """Looks for single effects and for few kinds, joint fit of all candidates, elimination, substitution by like ones.
 
     The joint fit begins where the single effects that are clear have led, if it promises more than a trifle there.
-    Where stops of joints, a few kinds or single effects meet exact data, nothing else is needed. One kind is looked
+    Where stops of joints, single effects or a few kinds meet exact data, nothing else is needed. One kind is looked
     for in measured data too, where contacts hold larger fits in kinks and the declared parameters alone are far from
     the noise.
 
@@ -234,22 +234,24 @@ def search(on: Selectors, base: Model, screening: Screening, seed: int = 0) -> S
     stopped = with_stops(rough, Selection(alone))
     if rough.met(stopped.model):
         return stopped
-    if rough.train.exact or (rough.train.touching and rough.far(alone)):
+    exact = rough.train.exact
+    first = one_by_one(rough, alone, looked_at, screening) if exact else None
+    if first is not None and rough.met(first.model):
+        return settle(on, first, screening)
+    if exact or (rough.train.touching and rough.far(alone)):
         on.say(0.2, "looking for a few kinds")
         one = few_kinds(rough, screening, alone.fit)
         if one is not None:
             selection = settle(on, Selection(one), screening)
-            enough = rough.train.exact or judged(on.fine, selection.model, seed).adequate
+            enough = exact or judged(on.fine, selection.model, seed).adequate
             return selection if enough else go_on(on, selection, screening)
-    on.say(0.2, "looking for single effects")
-    first = rough.look_forward(Selection(alone), looked_at, alike=screening.alike)
+    if first is None:
+        first = one_by_one(rough, alone, looked_at, screening)
     chosen = sorted({*worth_fitting(on.fine, screening), *first.model.effects})
     if first.model.effects:
         on = aligned(on, first.model.fit.values)
         rough, begin = on.rough, first.model
         alone, first.model = rough.model((), base.fit), rough.model(begin.effects, begin.fit)
-    if rough.nearly_met(first.model):
-        first.model = rough.led_on(first.model)
     if rough.met(first.model) or rough.promise(first.model, chosen) < GAIN:  # all together could not be clear
         return settle(on, first, screening)
     on.say(0.3, f"fitting {len(chosen)} candidates together")
@@ -261,6 +263,15 @@ def search(on: Selectors, base: Model, screening: Screening, seed: int = 0) -> S
     else:
         selection = rough.look_forward(first, looked_at, INSTEAD, screening.alike)
     return settle(on, selection, screening)
+
+
+def one_by_one(selector: Selector, alone: Model, candidates: Sequence[int], screening: Screening) -> Selection:
+    """The single effects that are clear one after the other, beside the declared parameters ``alone``."""
+    selector.say(0.0, "looking for single effects")
+    found = selector.look_forward(Selection(alone), candidates, alike=screening.alike)
+    if selector.nearly_met(found.model):
+        found.model = selector.led_on(found.model)
+    return found
 
 
 def go_on(on: Selectors, found: Selection, screening: Screening) -> Selection:
