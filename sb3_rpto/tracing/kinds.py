@@ -11,7 +11,7 @@ from sb3_rpto.tracing.screen import Screening, screen
 from sb3_rpto.tracing.select import JOINT, TENTH, Model, Selector
 
 #: So many of the nearest are led on.
-NEAREST = 3
+NEAREST = 4
 #: Most kinds that account for exact data together.
 MOST = 3
 #: A further one is looked for where the nearest lowers the cost to less than this share.
