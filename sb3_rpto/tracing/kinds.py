@@ -10,7 +10,7 @@ from sb3_rpto.tracing.loss import FAR
 from sb3_rpto.tracing.screen import Screening, screen
 from sb3_rpto.tracing.select import JOINT, TENTH, Model, Selector
 
-#: So many of the nearest are led on.
+#: So many of the nearest are led on: dry friction may lie behind what holds it and more, and what gives way.
 NEAREST = 4
 #: Most kinds that account for exact data together.
 MOST = 3

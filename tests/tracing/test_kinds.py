@@ -80,10 +80,21 @@ def test_kinds_are_given_up_where_the_nearest_hardly_helps() -> None:
     assert looked == ["torque_offset at all places", "coulomb_friction at all places"]
 
 
-@pytest.mark.slow
-def test_a_kind_that_meets_exact_data_ends_the_search_before_single_effects_are_looked_for() -> None:
+def test_a_single_effect_that_meets_exact_data_ends_the_search_before_kinds_are_looked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     s = selector([CoulombFriction("hinge", level=0.08)])
-    s.look_forward = None  # type: ignore[method-assign, assignment]
+    monkeypatch.setattr("sb3_rpto.tracing.search.few_kinds", None)
+    begun = base(s)
+    selection = search(Selectors(s, s, lambda share, what: None), begun, screen(s.train, begun.fit))
+    assert selection.model.effects == (COULOMB,)
+
+
+@pytest.mark.slow
+def test_a_kind_that_meets_exact_data_ends_the_search_before_all_candidates_are_fitted_together() -> None:
+    s = selector([CoulombFriction("hinge", level=0.08)])
+    s.look_forward = lambda selection, *_, **__: selection  # type: ignore[method-assign]
+    s.together = None  # type: ignore[method-assign, assignment]
     begun = base(s)
     selection = search(Selectors(s, s, lambda share, what: None), begun, screen(s.train, begun.fit))
     assert selection.model.effects == (COULOMB,)
