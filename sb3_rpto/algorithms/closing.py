@@ -72,7 +72,8 @@ class LoopCloser:
         #: transitions of the target that were ever added before the last trace
         self._traced_at: int | None = None
         self._error = math.inf
-        #: called while it traces, as :func:`~sb3_rpto.tracing.trace.trace` calls it; no checkpoint holds it
+        #: called while it traces, as :func:`~sb3_rpto.tracing.trace.trace` calls it, and while the policy then learns
+        #: in the corrected simulator, with the share of ``retrain_steps``; no checkpoint holds it
         self.progress: Progress | None = None
         #: whether the last transitions held too few windows to be traced
         self._untraced = False

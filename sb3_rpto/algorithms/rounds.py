@@ -35,6 +35,7 @@ class Rounds:
     def learn(self, model: Looping, loop: LoopCloser) -> None:
         """Learn until the end."""
         if not self.steps:
+            self._tell(model, loop, f"learning in the corrected simulator, at most {model.retrain_steps:,} steps")
             loop.rehearse(model)
         source = model._source_world
         assert isinstance(source, EpisodeSource)
@@ -51,12 +52,20 @@ class Rounds:
             earned = float(np.mean(source.returns)) if source.returns else math.inf
             if loop.may_judge(model):
                 earned = loop.rehearsals.best
-            if model.verbose:
-                print(f"learning in the corrected simulator: {self.steps} source steps, return {earned:.5g}")
+            self._tell(
+                model, loop, f"learning in the corrected simulator: {self.steps:,} source steps, return {earned:.5g}"
+            )
             self._idle = 0 if earned > self._bar else self._idle + 1
             self._bar = earned + RISE * abs(earned) if self._bar < earned < math.inf else self._bar
         if loop.rehearsals.is_behind(model):
             loop.rehearse(model)
+
+    def _tell(self, model: Looping, loop: LoopCloser, what: str) -> None:
+        """Tell who waits for it, for minutes."""
+        if model.verbose:
+            print(what)
+        if loop.progress is not None:
+            loop.progress(min(self.steps / max(model.retrain_steps, 1), 1.0), what)
 
 
 def learn_for_a_step(model: Looping, source_steps: int) -> int:

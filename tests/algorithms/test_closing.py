@@ -780,6 +780,11 @@ class Judge:
     def __init__(self, earns: list[float], judges: bool) -> None:
         self.earns, self.judges, self.rehearsals = earns, judges, self
         self.best, self.asked = -np.inf, 0
+        self.told: list[float] = []
+
+    def progress(self, share: float, what: str) -> None:
+        assert what.startswith("learning in the corrected simulator")
+        self.told.append(share)
 
     def may_judge(self, model: Any) -> bool:
         return self.judges
@@ -837,6 +842,7 @@ def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
     Rounds().learn(made, judge)  # type: ignore[arg-type]
     assert remaining == [1 - 160 * i / 1_280 for i in range(lasts)]  # for a schedule of the learning rate
     assert updates == [30] * lasts
+    assert judge.told == [i / 8 for i in range(lasts + 1)]
     assert judge.asked == 1 + lasts + 1
     assert source.asked == [8 * 20] * lasts  # in the source each call draws gSDE's noise anew
     assert made.source_timesteps == 5 + 8 * 20 * lasts

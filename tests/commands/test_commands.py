@@ -210,6 +210,7 @@ def test_a_closed_loop_leaves_its_report_and_the_corrected_simulator(
     said = capsys.readouterr()
     assert f"200 steps: explained, link_length(pole2) named; written: {out / 'report.html'}" in said.out
     assert "predicting the test runs" in said.err
+    assert "learning in the corrected simulator: 1" in said.err
     (found,) = json.loads((out / "report.json").read_text())["effects"]
     assert found["parameters"]["change"]["value"] == pytest.approx(1.0, abs=1e-3)
     assert [effect.label for effect in load_corrected(out).effects] == ["link_length(pole2)"]
