@@ -313,7 +313,7 @@ class GeomFriction(Effect):
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
             return []
         names = object_names(model, "geom")
-        return [names[g] for g in range(model.ngeom) if any(_may_touch(model, g, h) for h in range(model.ngeom))]
+        return [names[g] for g in range(model.ngeom) if any(_may_slip(model, g, h) for h in range(model.ngeom))]
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Change the coefficient."""
@@ -321,10 +321,51 @@ class GeomFriction(Effect):
         friction[:] = np.maximum(friction + x[:, 0], 0.0)
 
 
+@register
+class ContactSoftness(Effect):
+    r"""Softer or bouncier contacts of a geom that stands still: :math:`((1 + s)\,\tau,\ (1 + d)\,\zeta)`.
+
+    :math:`\tau` and :math:`\zeta` are the time constant and the damping ratio of MuJoCo's ``solref``. A contact has the
+    mean of its two geoms' (weighted by ``solmix``; at unequal ``priority`` those of the higher), so softer feet show as
+    a softer ground, and no :math:`\tau` below twice the time step: a model that is there cannot be harder.
+    """
+
+    kind = "contact_softness"
+    place = "geom"
+    parameters = (
+        Parameter("softness", "", 0.1, lower=-0.9, upper=9.0),
+        Parameter("damping", "", 0.1, lower=-0.9, upper=9.0),
+    )
+    equation = "(1 + softness) time constant, (1 + damping) damping ratio of contacts"
+    native = "solref"
+    excite = "feet that land and lift"
+    same = ("timeconst", "dampratio")
+    offered = False
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Geoms of the world that may touch another, with a time constant: not with stiffness and damping instead."""
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+            return []
+        names = object_names(model, "geom")
+        still = (model.body_weldid[model.geom_bodyid] == 0) & (model.geom_solref[:, 0] > 0)
+        geoms = [g for g in range(model.ngeom) if still[g]]
+        return [names[g] for g in geoms if any(_may_touch(model, g, h) for h in range(model.ngeom))]
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Scale the geom's numbers."""
+        world.field("geom_solref")[:, self.index] *= 1 + x
+
+
 def _may_touch(model: mujoco.MjModel, g: int, h: int) -> bool:
-    """Whether two geoms collide by their bits and their bodies can move against each other, and friction is felt."""
+    """Whether two geoms collide by their bits and their bodies can move against each other."""
     bits = (model.geom_contype[g] & model.geom_conaffinity[h]) | (model.geom_contype[h] & model.geom_conaffinity[g])
     one, other = (int(model.body_weldid[model.geom_bodyid[i]]) for i in (g, h))
     parent = model.body_weldid[model.body_parentid]
     kin = bool(one and other) and (parent[one] == other or parent[other] == one)
-    return bool(bits) and one != other and not kin and max(model.geom_condim[g], model.geom_condim[h]) > 1
+    return bool(bits) and one != other and not kin
+
+
+def _may_slip(model: mujoco.MjModel, g: int, h: int) -> bool:
+    """Whether they do, and friction is felt."""
+    return _may_touch(model, g, h) and max(model.geom_condim[g], model.geom_condim[h]) > 1

@@ -27,7 +27,8 @@ class Declared(Effect):
     :mod:`sb3_rpto.effects.length`); ``mass`` scales the inertia with it, and is that at the nominal length where
     the length is declared too; ``inertia`` is the first principal moment, the others in proportion, at whatever mass;
     ``kp`` is the stiffness of a position servo, ``kv`` its damping or the gain of a velocity servo, ``strength`` a
-    factor on all that an actuator does (gain, bias and force limits), ``timeconst`` that of its filter.
+    factor on all that an actuator does (gain, bias and force limits), ``timeconst`` that of its filter, or, with
+    ``dampratio``, a geom's ``solref``.
 
     :param model: the model that has it
     :param name: ``<object>.<parameter>``, with ``joint:`` (``body:``, ``geom:``, ``actuator:``) before the object

@@ -28,17 +28,17 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
     actuator on a hinge or slide without activation        dc_motor
     moving body that has mass                              payload
     moving body that has a capsule                         link_length
-    geom that may touch another                            geom_friction
+    geom that may touch another with friction              geom_friction
     world                                                  gravity_tilt (with gravity), wind (in a fluid), fluid
     =====================================================  ==========================================================
 
     An effect is left out where the same number is declared: ``hinge.damping`` leaves out viscous_friction(hinge),
     ``frictionloss`` coulomb_friction, ``stiffness`` spring, ``range`` end_stop, ``armature`` armature, ``arm.length``
-    link_length(arm), a geom's ``friction`` geom_friction, an actuator's ``gain``, ``gear`` or ``strength``
-    command_gain, ``option.density`` and ``option.viscosity`` fluid. A declared mass leaves payload in: it moves the
-    centre of mass too.
-    soft_friction, held forces and gravity_scale, which no machine has, mass_scale, com_offset, external_force,
-    command_offset and command_smoothing are left out unless they are named.
+    link_length(arm), a geom's ``friction`` geom_friction, its ``timeconst`` or ``dampratio`` contact_softness, an
+    actuator's ``gain``, ``gear`` or ``strength`` command_gain, ``option.density`` and ``option.viscosity`` fluid. A
+    declared mass leaves payload in: it moves the centre of mass too.
+    soft_friction, held forces and gravity_scale, which no machine has, mass_scale, com_offset, contact_softness,
+    external_force, command_offset and command_smoothing are left out unless they are named.
 
     :param model: the compiled model
     :param exclude: names of declared parameters, as :func:`~sb3_rpto.effects.declare` takes them

@@ -114,6 +114,15 @@ def _read_timeconst(model: mujoco.MjModel, actuator: int) -> float:
     return float(model.actuator_dynprm[actuator, 0])
 
 
+def _solref(column: int) -> _Read:
+    def read(model: mujoco.MjModel, geom: int) -> float:
+        if model.geom_solref[geom, 0] <= 0:
+            raise ValueError("the geom's solref holds stiffness and damping; give it a time constant and damping ratio")
+        return float(model.geom_solref[geom, column])
+
+    return read
+
+
 def _read_gain(model: mujoco.MjModel, actuator: int) -> float:
     _read_strength(model, actuator)
     if model.actuator_gaintype[actuator] not in GAINS:
@@ -187,7 +196,11 @@ NUMBERS: dict[str, dict[str, Number]] = {
         "inertia": Number("kg·m²", *_column("body_inertia", 0)[:1], _write_inertia, lambda s: s.inertia, (0.03, 30.0)),
         "length": Number("m", _read_length, write_length, lambda s: 0.1, (0.5, 2.0)),
     },
-    "geom": {"friction": Number("", *_column("geom_friction", 0), lambda s: 0.1)},
+    "geom": {
+        "friction": Number("", *_column("geom_friction", 0), lambda s: 0.1),
+        "timeconst": Number("s", _solref(0), _column("geom_solref", 0)[1], lambda s: 0.01, _POSITIVE),
+        "dampratio": Number("", _solref(1), _column("geom_solref", 1)[1], lambda s: 0.1, _POSITIVE),
+    },
     "actuator": {
         "gear": Number("", _read_gear, _write_gear, lambda s: 1.0, _POSITIVE),
         "gain": Number("", _read_gain, _column("actuator_gainprm", 0)[1], lambda s: 1.0, _POSITIVE),

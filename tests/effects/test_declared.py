@@ -238,6 +238,8 @@ def written(world: World, name: str, value: float) -> World:
         ("speed.kv", 2.0, "actuator_biasprm", (2, 1), 0.0),
         ("slow.timeconst", 0.08, "actuator_dynprm", (3, 0), 0.08),
         ("rod.friction", 0.3, "geom_friction", (0, 0), 0.3),
+        ("rod.timeconst", 0.05, "geom_solref", (0, 0), 0.05),
+        ("rod.dampratio", 0.5, "geom_solref", (0, 1), 0.5),
         ("option.gravity", 4.905, "opt.gravity", 2, -4.905),
         ("option.density", 3.0, "opt.density", (), 3.0),
         ("option.viscosity", 0.2, "opt.viscosity", (), 0.2),

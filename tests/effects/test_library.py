@@ -46,6 +46,20 @@ SLED = mujoco.MjModel.from_xml_string("""
   <actuator><motor name="engine" joint="x" gear="60"/></actuator>
 </mujoco>""")
 
+#: A ball that falls, bounces and is pushed.
+BALL = mujoco.MjModel.from_xml_string("""
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="9 9 1"/>
+    <body name="ball" pos="0 0 0.12">
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <geom name="rubber" size="0.1" density="500"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="z" gear="30"/></actuator>
+</mujoco>""")
+
 #: An arm that swings into both stops.
 STOPPED = mujoco.MjModel.from_xml_string("""
 <mujoco>
@@ -197,6 +211,7 @@ ROWS = {
     "wind": Row("", {"x": 2.0, "y": -1.5, "z": 1.0}, {"x": 0.0, "y": 0.0, "z": 0.0}),
     "fluid": Row("", {"density": 150.0, "viscosity": 0.5}, {"density": 30.0, "viscosity": 0.1}),
     "geom_friction": Row("runner", {"change": 0.2}, {"change": 0.05}, model=SLED),
+    "contact_softness": Row("floor", {"softness": 0.5, "damping": -0.3}, {"softness": 0.1, "damping": 0.0}, model=BALL),
 }
 FORCES = [kind for kind, row in ROWS.items() if row.torque is not None]
 
@@ -537,7 +552,23 @@ def test_geom_friction_is_the_contacts() -> None:
         np.testing.assert_array_equal(row, expected)
 
 
-DIMENSIONLESS = {"share", "mu", "mu_driving", "mu_driven", "change", "along"}
+@pytest.mark.parametrize("geom", ["floor", "rubber"])
+def test_a_softer_ground_has_the_contacts_of_softer_bodies(geom: str) -> None:
+    """A contact has the mean of its two geoms' numbers, and so half of one's change."""
+    sim = Simulation(BALL, [LIBRARY["contact_softness"]("floor")], 1)
+    start, drive = (np.zeros((2, 1)), np.zeros((2, 1))), Drive(np.zeros((2, 80, 1)))
+    got = sim.rollout(np.array([[0.0, 0.0], [1.5, -0.5]]), *start, drive)[0]
+
+    def soften(m: mujoco.MjModel) -> None:
+        m.geom(geom).solref *= (2.5, 0.5)
+
+    for row, model in zip(got, (BALL, edited(BALL, soften))):
+        expected = Simulation(model, [], 1).rollout(np.empty((2, 0)), *start, drive)[0][0]
+        np.testing.assert_allclose(row, expected, rtol=1e-12)
+    assert got[1].min() < got[0].min() - 1e-3  # it gives way
+
+
+DIMENSIONLESS = {"share", "mu", "mu_driving", "mu_driven", "change", "along", "softness", "damping"}
 
 
 @pytest.mark.parametrize("kind", ROWS)

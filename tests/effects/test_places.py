@@ -186,6 +186,22 @@ def test_the_centre_of_mass_of_a_body_that_mujoco_simplifies_is_refused() -> Non
         Simulation(model, [LIBRARY["com_offset"]("target", x=0.1)], 1)
 
 
+def test_softness_is_offered_at_what_stands_still_and_has_a_time_constant() -> None:
+    def model(solref: str, flag: str = "enable") -> mujoco.MjModel:
+        return mujoco.MjModel.from_xml_string(f"""<mujoco><option><flag contact="{flag}"/></option><worldbody>
+        <geom name="floor" type="plane" size="1 1 1" solref="{solref}"/>
+        <geom name="seen" size="1" contype="0" conaffinity="0"/>
+        <body><joint type="slide"/><geom name="foot" size=".1"/></body></worldbody></mujoco>""")
+
+    def offered(model: mujoco.MjModel) -> list[str]:
+        return [effect.label for effect in candidates(model, kinds={"contact_softness"})]
+
+    assert offered(model(".02 1")) == ["contact_softness(floor)"]
+    assert offered(model(".02 1", "disable")) == offered(model("-900 -40")) == []
+    with pytest.raises(ValueError, match="solref holds stiffness and damping; give it a time constant"):
+        declare(model("-900 -40"), ["floor.timeconst"])
+
+
 def test_delays_of_one_sensor_add_up() -> None:
     def shown(*layers: list[float]) -> np.ndarray:
         env = gym.make("InvertedPendulum-v5")

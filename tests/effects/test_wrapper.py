@@ -131,14 +131,21 @@ def from_library(kind, model):
     return [cls(cls.places(model)[-1], **values)]
 
 
+def in_touch(name):
+    """With a medium, and the last geom colliding with others."""
+    env = gym.make(name)
+    model = env.unwrapped.model
+    model.opt.density, model.geom_contype[-1] = 1.2, 1
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return env
+
+
 @pytest.mark.parametrize("kind", ["", *SHIPPED])
 def test_it_steps_as_the_batch_does(kind):
-    env = gym.make(POLE)
+    env = in_touch(POLE)
     if kind and not LIBRARY[kind].places(env.unwrapped.model):
-        env = gym.make("Reacher-v5")  # its target moves in two ways
+        env = in_touch("Reacher-v5")  # its target moves in two ways
     base = env.unwrapped
-    base.model.opt.density, base.model.geom_contype[-1] = 1.2, 1  # for the wind and the friction of contacts
-    mujoco.mj_setConst(base.model, mujoco.MjData(base.model))
     nominal = copy.copy(base.model)
     chosen = from_library(kind, nominal) if kind else effects(nominal)
     wrapped = CorrectedEnv(env, chosen)

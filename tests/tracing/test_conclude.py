@@ -133,6 +133,16 @@ def test_other_numbers_of_a_simulator_are_explained_where_nothing_is_declared(pl
         assert traced.effect.values == pytest.approx(effect.values, abs=2e-4)
 
 
+def test_a_softer_ground_is_found_in_the_states_of_a_simulator() -> None:
+    source, softer = gym.make("HalfCheetah-v5"), LIBRARY["contact_softness"]("floor", softness=0.5, damping=-0.2)
+    target = apply_effects(gym.make("HalfCheetah-v5"), [softer])
+    kinds = ["contact_softness", "geom_friction", "end_stop", "viscous_friction", "gravity_tilt"]
+    report = trace(source, transitions(source, target), candidates=kinds, threads=1)
+    assert report.verdict == "explained"
+    assert [traced.label for traced in report.effects] == [softer.label]
+    assert report.effects[0].effect.values == pytest.approx(softer.values, abs=1e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("less", [True, False])
 def test_a_log_tells_that_the_model_has_too_much(less: bool) -> None:
