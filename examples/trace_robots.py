@@ -1,4 +1,4 @@
-"""Nine robots of gymnasium, six effects, none, and gusts: what do 300 transitions of random actions say?
+"""Nine robots of gymnasium, seven effects, none, and gusts: what do 300 transitions of random actions say?
 
     python examples/trace_robots.py
     python examples/trace_robots.py --robots Ant-v5 Reacher-v5 --kinds nothing coulomb_friction
@@ -20,7 +20,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from sb3_rpto.experiments.provenance import machine, versions
-from sb3_rpto.experiments.robots import CAUSES, ROBOTS, Job, run
+from sb3_rpto.experiments.robots import CAUSES, ROBOTS, Job, fits, run
 from sb3_rpto.files import write_json
 
 
@@ -38,6 +38,7 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
     # Kind by kind, so that an unfinished table is a fair sample.
     jobs = [Job(robot, kind, seed) for seed, kind, robot in product(a.seeds, a.kinds, a.robots)]
+    jobs = [job for job in jobs if fits(job)]
     with ProcessPoolExecutor(a.workers) as pool:
         rows = list(tqdm(pool.map(partial(run, folder=a.runs), jobs), total=len(jobs), desc="traces"))
     table = pd.DataFrame(rows)

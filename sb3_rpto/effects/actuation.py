@@ -24,6 +24,17 @@ def command_limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
+def servo_of(model: mujoco.MjModel, actuator: int) -> str:
+    """What an actuator regulates: its bias takes back its gain on the position, ``kp (u - q)``, or on the velocity."""
+    gain, (_, on_position, on_velocity) = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, :3]
+    if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE and gain:
+        if on_position == -gain:
+            return "position"
+        if on_velocity == -gain and not on_position:
+            return "velocity"
+    return ""
+
+
 def memoryless(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether an actuator's force follows from its command and its joint alone: no activation, delay or tendon."""
     return bool(

@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.actuation import GAINS
+from sb3_rpto.effects.actuation import GAINS, servo_of
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.world import World
@@ -141,6 +141,30 @@ class CommandGain(Effect):
     def write(self, world: World, x: np.ndarray) -> None:
         """Scale the gain."""
         world.field("actuator_gainprm")[:, self.index, :3] *= 1 + x
+
+
+@register
+class ServoGain(Effect):
+    r"""A position servo of another stiffness, :math:`(1 + g)\,k_p\,(u - q)`: MuJoCo's ``kp``; its damping stays."""
+
+    kind = "servo_gain"
+    place = "actuator"
+    parameters = (Parameter("change", "", 0.03, lower=-0.9, upper=9.0),)
+    equation = "(1 + change) kp (u - q)"
+    native = "kp"
+    excite = "commands that jump, and loads that the servo gives way to"
+    same = ("kp", "strength")
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Position servos."""
+        ids = {name: i for i, name in enumerate(object_names(model, "actuator"))}
+        return [name for name in super().places(model) if servo_of(model, ids[name]) == "position"]
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Scale the gain and what it takes back."""
+        world.field("actuator_gainprm")[:, self.index, 0] *= 1 + x[:, 0]
+        world.field("actuator_biasprm")[:, self.index, 1] *= 1 + x[:, 0]
 
 
 @register

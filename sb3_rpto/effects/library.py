@@ -26,6 +26,7 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
     actuator                                               command_delay, command_deadband, command_gain,
                                                            command_saturation, backlash, actuator_lag
     actuator on a hinge or slide without activation        dc_motor
+    position servo                                         servo_gain
     moving body that has mass                              payload
     moving body that has a capsule                         link_length
     geom that may touch another with friction              geom_friction
@@ -35,8 +36,9 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
     An effect is left out where the same number is declared: ``hinge.damping`` leaves out viscous_friction(hinge),
     ``frictionloss`` coulomb_friction, ``stiffness`` spring, ``range`` end_stop, ``armature`` armature, ``arm.length``
     link_length(arm), a geom's ``friction`` geom_friction, its ``timeconst`` or ``dampratio`` contact_softness, an
-    actuator's ``gain``, ``gear`` or ``strength`` command_gain, ``option.density`` and ``option.viscosity`` fluid. A
-    declared mass leaves payload in: it moves the centre of mass too.
+    actuator's ``gain``, ``gear`` or ``strength`` command_gain, its ``kp`` or ``strength`` servo_gain,
+    ``option.density`` and ``option.viscosity`` fluid. A declared mass leaves payload in: it moves the centre of mass
+    too.
     soft_friction, held forces and gravity_scale, which no machine has, mass_scale, com_offset, contact_softness,
     external_force, command_offset and command_smoothing are left out unless they are named.
 

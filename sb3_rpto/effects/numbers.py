@@ -8,7 +8,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.actuation import BIASES, GAINS, LAGS
+from sb3_rpto.effects.actuation import BIASES, GAINS, LAGS, servo_of
 from sb3_rpto.effects.effect import Scales
 from sb3_rpto.effects.length import held_by_constraint, link_length, write_length
 from sb3_rpto.effects.world import World
@@ -70,17 +70,6 @@ def _write_mass(world: World, body: int, values: np.ndarray, nominal: float) -> 
 def _write_inertia(world: World, body: int, values: np.ndarray, nominal: float) -> None:
     inertia = world.field("body_inertia")[:, body]
     inertia *= (values / inertia[:, 0])[:, None]
-
-
-def servo_of(model: mujoco.MjModel, actuator: int) -> str:
-    """What an actuator regulates: its bias takes back its gain on the position, ``kp (u - q)``, or on the velocity."""
-    gain, (_, on_position, on_velocity) = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, :3]
-    if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE and gain:
-        if on_position == -gain:
-            return "position"
-        if on_velocity == -gain and not on_position:
-            return "velocity"
-    return ""
 
 
 def _read_kp(model: mujoco.MjModel, actuator: int) -> float:

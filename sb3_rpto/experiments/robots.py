@@ -37,7 +37,7 @@ ROBOTS = {
 #: Transitions of uniformly random actions.
 TRANSITIONS = 300
 #: What is put in: sizes are shares of the largest force of the joint's motor, at the speed in rad/s or m/s that
-#: follows, of the command that is added to it, or of a step of the environment.
+#: follows, of the command that is added to it, of a step of the environment, or of the ground's time constant.
 KINDS = {
     "coulomb_friction": (0.1, 0.0),
     "soft_friction": (0.1, 0.0),
@@ -45,6 +45,7 @@ KINDS = {
     "torque_offset": (0.1, 0.0),
     "command_gain": (0.8, 0.0),
     "command_delay": (0.5, 0.0),
+    "contact_softness": (0.5, 0.0),
 }
 #: What no effect of the library is has an amplitude of such a share.
 NOTHING, PUSHED = "nothing", 0.1
@@ -65,6 +66,12 @@ class Job:
     seed: int = 0
 
 
+def fits(job: Job) -> bool:
+    """Whether the robot has a place for what is put in: not all of them touch a ground."""
+    robot: Any = gym.make(job.robot).unwrapped
+    return job.kind not in KINDS or bool(LIBRARY[job.kind].places(robot.model))
+
+
 def make_target(job: Job) -> tuple[gym.Env, list[Effect]]:
     """The target, and what is in it beside gusts: the declared numbers, and an effect at a place that is drawn."""
     env = gym.make(job.robot)
@@ -78,11 +85,13 @@ def make_target(job: Job) -> tuple[gym.Env, list[Effect]]:
         if LIBRARY[job.kind].place == "joint":
             effect = LIBRARY[job.kind](model.joint(joint).name)
             value = size * peak_force(model, joint) / (speed**2 or 1.0)
+        elif LIBRARY[job.kind].place == "geom":
+            effect, value = LIBRARY[job.kind](LIBRARY[job.kind].places(model)[0]), size
         else:
             effect = LIBRARY[job.kind](object_names(model, "actuator")[motor])
             value = size * robot.dt if job.kind == "command_delay" else size
         effect.bind(model)
-        effects.append(effect.with_values(np.array([value])))
+        effects.append(effect.with_values(np.array([value, *effect.values[1:]])))
     target: gym.Env = apply_effects(env, effects)
     if job.kind == GUSTS:
         target = Gusts(target, job.seed, int(model.jnt_dofadr[joint]), PUSHED * peak_force(model, joint))

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
-from sb3_rpto.effects.numbers import servo_of
+from sb3_rpto.effects.actuation import servo_of
 from sb3_rpto.effects.units import joint_of
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE, Adequacy

@@ -46,6 +46,26 @@ SLED = mujoco.MjModel.from_xml_string("""
   <actuator><motor name="engine" joint="x" gear="60"/></actuator>
 </mujoco>""")
 
+#: Servos that hold an arm at commanded angles, and one that moves it at commanded speeds.
+SERVOS = mujoco.MjModel.from_xml_string("""
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="shoulder" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03"/>
+      <body name="hand" pos="0 0 -0.4">
+        <joint name="wrist" axis="0 1 0" damping="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.03"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="servo" joint="shoulder" kp="20" kv="1" forcerange="-15 15"/>
+    <velocity name="speed" joint="wrist" kv="0.5"/>
+  </actuator>
+</mujoco>""")
+
 #: A ball that falls, bounces and is pushed.
 BALL = mujoco.MjModel.from_xml_string("""
 <mujoco>
@@ -194,6 +214,7 @@ ROWS = {
     "command_delay": Row("shoulder_motor", {"delay": 0.026}, {"delay": 0.01}),
     "command_deadband": Row("elbow_motor", {"width": 0.1}, {"width": 0.02}),
     "command_gain": Row("shoulder_motor", {"change": -0.15}, {"change": 0.0}),
+    "servo_gain": Row("servo", {"change": -0.2}, {"change": 0.1}, model=SERVOS),
     "command_saturation": Row("shoulder_motor", {"inverse_limit": 1.6}, {"inverse_limit": 1.2}),
     "backlash": Row("elbow_motor", {"half_width": 0.15}, {"half_width": 0.05}),
     "actuator_lag": Row("shoulder_motor", {"time_constant": 0.05}, {"time_constant": 0.01}),
@@ -523,6 +544,16 @@ def test_another_gravity_is_the_options() -> None:
 
     got = one_step(ARM, [LIBRARY["gravity_scale"](change=-0.5)])
     np.testing.assert_array_equal(got, one_step(edited(ARM, halve), []))
+
+
+def test_another_stiffness_of_a_servo_is_its_kp() -> None:
+    def softer(m: mujoco.MjModel) -> None:
+        m.actuator_gainprm[0, 0], m.actuator_biasprm[0, 1] = 15, -15
+
+    assert LIBRARY["servo_gain"].places(SERVOS) == ["servo"]
+    got = one_step(SERVOS, [LIBRARY["servo_gain"]("servo", change=-0.25)])
+    np.testing.assert_array_equal(got, one_step(edited(SERVOS, softer), []))
+    assert not np.allclose(got, one_step(SERVOS, []))
 
 
 def test_tilt_turns_gravity() -> None:

@@ -145,6 +145,8 @@ def test_it_steps_as_the_batch_does(kind):
     env = in_touch(POLE)
     if kind and not LIBRARY[kind].places(env.unwrapped.model):
         env = in_touch("Reacher-v5")  # its target moves in two ways
+        model = env.unwrapped.model  # and its motors shall be servos
+        model.actuator_biastype[:], model.actuator_biasprm[:, 1] = mujoco.mjtBias.mjBIAS_AFFINE, -1
     base = env.unwrapped
     nominal = copy.copy(base.model)
     chosen = from_library(kind, nominal) if kind else effects(nominal)
