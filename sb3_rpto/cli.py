@@ -80,7 +80,7 @@ Say which effect a simulator lacks to explain recordings of a machine.
 
 The declared parameters of the model are fitted to the recordings first. Where the
 fitted model still errs by more than the measurement noise, friction, delays, offsets
-and some twenty other effects are tried at all joints and motors. The verdict is
+and some thirty other effects are tried at all joints and motors. The verdict is
 complete, explained, partly explained or unexplained.
 """
 

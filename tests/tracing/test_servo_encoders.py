@@ -1,4 +1,7 @@
-"""A servo whose encoder has a wrong zero, simulated without MuJoCo: gravity acts at another angle than is shown."""
+"""A servo with a wrong zero of its encoder or another stiffness, simulated without MuJoCo.
+
+Where the zero is wrong gravity acts at another angle than is shown.
+"""
 
 import numpy as np
 import pytest
@@ -11,15 +14,16 @@ ARM = f"""<mujoco><option timestep="0.005"/><worldbody><body><joint name="hinge"
 <actuator><position name="servo" joint="hinge" kp="{KP}"/></actuator></mujoco>"""
 
 
-def swung(rng: np.random.Generator, offset: float, duration: float = 4.0, steps: int = 20) -> dict[str, np.ndarray]:
+def swung(rng: np.random.Generator, offset: float, kp: float, duration: float = 4.0) -> dict[str, np.ndarray]:
     """A run of goals that are held for a while, by semi-implicit Euler; the pendulum hangs at zero."""
+    steps = 20
     count, dt = round(duration * RATE), 1 / RATE / steps
     goals = np.repeat(rng.uniform(-1.5, 1.5, count // 40 + 1), 40)[:count]
     inertia, q, v, seen = MASS * LENGTH**2, rng.uniform(-0.5, 0.5), 0.0, np.empty(count)
     for k, goal in enumerate(goals):
         seen[k] = q + offset
         for _ in range(steps):
-            torque = KP * (goal - q - offset) - DAMPING * v - MASS * 9.81 * LENGTH * np.sin(q)
+            torque = kp * (goal - q - offset) - DAMPING * v - MASS * 9.81 * LENGTH * np.sin(q)
             v += dt * torque / inertia
             q += dt * v
     return {
@@ -29,12 +33,12 @@ def swung(rng: np.random.Generator, offset: float, duration: float = 4.0, steps:
     }
 
 
-def traced(offset: float) -> Report:
+def traced(offset: float, kp: float = KP, declared: tuple[str, ...] = ("hinge.damping", "servo.kp")) -> Report:
     rng = np.random.default_rng(3)
-    runs = {f"run{i}": swung(rng, offset) for i in range(6)}
-    kinds = ["sensor_bias", "sensor_gain", "torque_offset", "command_gain", "coulomb_friction", "spring"]
+    runs = {f"run{i}": swung(rng, offset, kp) for i in range(6)}
+    kinds = ["sensor_bias", "sensor_gain", "torque_offset", "command_gain", "servo_gain", "coulomb_friction", "spring"]
     data = Measurements.from_tables(runs)
-    return trace(ARM, data, ["hinge.damping", "servo.kp"], candidates=kinds, threads=1)
+    return trace(ARM, data, declared, candidates=kinds, threads=1)
 
 
 @pytest.mark.slow
@@ -54,3 +58,13 @@ def test_the_zero_is_found_and_not_what_it_resembles() -> None:
 @pytest.mark.slow
 def test_a_right_zero_is_no_finding() -> None:
     assert traced(0.0).verdict == "complete"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("change", [-0.2, 0.0])
+def test_another_stiffness_is_found_where_nobody_declared_it(change: float) -> None:
+    report = traced(0.0, (1 + change) * KP, declared=("hinge.damping",))
+    assert report.verdict == ("explained" if change else "complete")
+    assert [found.label for found in report.effects] == ["servo_gain(servo)"] * bool(change)
+    for found in report.effects:
+        assert found.effect.values[0] == pytest.approx(change, abs=0.005)
