@@ -168,6 +168,32 @@ class ServoGain(Effect):
 
 
 @register
+class ServoDamping(Effect):
+    r"""A position servo that damps its joint otherwise, :math:`-(1 + c)\,k_v\,\dot q`: MuJoCo's ``kv``.
+
+    More of it is a ``viscous_friction``, and so is less while the joint's own damping lasts.
+    """
+
+    kind = "servo_damping"
+    place = "actuator"
+    parameters = (Parameter("change", "", 0.1, lower=-1.0, upper=9.0),)
+    equation = "-(1 + change) kv qd"
+    native = "kv"
+    excite = "motion at several speeds"
+    same = ("kv", "strength")
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Position servos that damp."""
+        damps = dict(zip(object_names(model, "actuator"), model.actuator_biasprm[:, 2] != 0))
+        return [name for name in ServoGain.places(model) if damps[name]]
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Scale the feedback of the speed."""
+        world.field("actuator_biasprm")[:, self.index, 2] *= 1 + x[:, 0]
+
+
+@register
 class CommandSaturation(Effect):
     r"""A limit of the amplifier, :math:`\mathrm{clip}(u, -1/s, 1/s)`, by its inverse: 0 is no limit.
 

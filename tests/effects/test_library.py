@@ -215,6 +215,7 @@ ROWS = {
     "command_deadband": Row("elbow_motor", {"width": 0.1}, {"width": 0.02}),
     "command_gain": Row("shoulder_motor", {"change": -0.15}, {"change": 0.0}),
     "servo_gain": Row("servo", {"change": -0.2}, {"change": 0.1}, model=SERVOS),
+    "servo_damping": Row("servo", {"change": -0.4}, {"change": 0.1}, model=SERVOS),
     "command_saturation": Row("shoulder_motor", {"inverse_limit": 1.6}, {"inverse_limit": 1.2}),
     "backlash": Row("elbow_motor", {"half_width": 0.15}, {"half_width": 0.05}),
     "actuator_lag": Row("shoulder_motor", {"time_constant": 0.05}, {"time_constant": 0.01}),
@@ -546,12 +547,13 @@ def test_another_gravity_is_the_options() -> None:
     np.testing.assert_array_equal(got, one_step(edited(ARM, halve), []))
 
 
-def test_another_stiffness_of_a_servo_is_its_kp() -> None:
+def test_a_servos_gains_are_its_kp_and_kv() -> None:
     def softer(m: mujoco.MjModel) -> None:
-        m.actuator_gainprm[0, 0], m.actuator_biasprm[0, 1] = 15, -15
+        m.actuator_gainprm[0, 0], m.actuator_biasprm[0, 1:3] = 15, (-15, -0.5)
 
-    assert LIBRARY["servo_gain"].places(SERVOS) == ["servo"]
-    got = one_step(SERVOS, [LIBRARY["servo_gain"]("servo", change=-0.25)])
+    names = ("servo_gain", "servo_damping")
+    assert [LIBRARY[name].places(SERVOS) for name in names] == [["servo"]] * 2
+    got = one_step(SERVOS, [LIBRARY[name]("servo", change=change) for name, change in zip(names, (-0.25, -0.5))])
     np.testing.assert_array_equal(got, one_step(edited(SERVOS, softer), []))
     assert not np.allclose(got, one_step(SERVOS, []))
 
