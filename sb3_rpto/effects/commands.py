@@ -180,7 +180,7 @@ class ServoDamping(Effect):
     equation = "-(1 + change) kv qd"
     native = "kv"
     excite = "motion at several speeds"
-    same = ("kv", "strength")
+    same = ("kv",)
 
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:

@@ -161,6 +161,24 @@ def test_what_is_declared_is_left_out(declared: str, gone: set[str]) -> None:
     assert offered(model()) - offered(model(), declared) == gone
 
 
+@pytest.mark.parametrize(
+    ("declared", "gone"),
+    [
+        ("servo.kp", {"servo_gain(servo)"}),
+        ("servo.kv", {"servo_damping(servo)"}),
+        ("servo.strength", {"servo_gain(servo)", "command_gain(servo)"}),  # beside it one of the two gains is free
+        ("floor.timeconst", {"contact_softness(floor)"}),
+        ("floor.dampratio", {"contact_softness(floor)"}),
+    ],
+)
+def test_gains_of_a_servo_and_contacts_that_are_declared_are_left_out(declared: str, gone: set[str]) -> None:
+    compiled = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/>
+    <body><joint name="hinge"/><geom size=".1"/></body></worldbody>
+    <actuator><position name="servo" joint="hinge" kp="9" kv="1"/></actuator></mujoco>""")
+    every = {e.label for e in candidates(compiled, kinds=LIBRARY)}
+    assert every - {e.label for e in candidates(compiled, [declared], LIBRARY)} == gone
+
+
 def test_unknown_exclusions_are_said() -> None:
     with pytest.raises(ValueError, match="did you mean 'slide'"):
         candidates(model(), ["slid.damping"])
