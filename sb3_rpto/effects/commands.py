@@ -171,7 +171,7 @@ class ServoGain(Effect):
 class ServoDamping(Effect):
     r"""A position servo that damps its joint otherwise, :math:`-(1 + c)\,k_v\,\dot q`: MuJoCo's ``kv``.
 
-    More of it is a ``viscous_friction``, and so is less while the joint's own damping lasts.
+    Data do not tell more of it from a ``viscous_friction``, nor less, while the joint's own damping lasts.
     """
 
     kind = "servo_damping"
