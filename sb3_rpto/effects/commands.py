@@ -171,7 +171,7 @@ class ServoGain(Effect):
 class ServoDamping(Effect):
     r"""A position servo that damps its joint otherwise, :math:`-(1 + c)\,k_v\,\dot q`: MuJoCo's ``kv``.
 
-    Data do not tell more of it from a ``viscous_friction``, nor less, while the joint's own damping lasts.
+    More of it is a ``viscous_friction`` to the data, and so is less, as far as the joint has damping of its own.
     """
 
     kind = "servo_damping"
