@@ -169,15 +169,15 @@ class ServoGain(Effect):
 
 @register
 class ServoDamping(Effect):
-    r"""A position servo that damps its joint less, :math:`-(1 - l)\,k_v\,\dot q`: MuJoCo's ``kv``.
+    r"""A position servo that damps its joint otherwise, :math:`-(1 + c)\,k_v\,\dot q`: MuJoCo's ``kv``.
 
     More of it is a ``viscous_friction`` to the data, and so is less, as far as the joint has damping of its own.
     """
 
     kind = "servo_damping"
     place = "actuator"
-    parameters = (Parameter("less", "", 0.1, lower=0.0, upper=1.0),)
-    equation = "-(1 - less) kv qd"
+    parameters = (Parameter("change", "", 0.1, lower=-1.0, upper=9.0),)
+    equation = "-(1 + change) kv qd"
     native = "kv"
     excite = "motion at several speeds"
     same = ("kv",)
@@ -190,7 +190,7 @@ class ServoDamping(Effect):
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Scale the feedback of the speed."""
-        world.field("actuator_biasprm")[:, self.index, 2] *= 1 - x[:, 0]
+        world.field("actuator_biasprm")[:, self.index, 2] *= 1 + x[:, 0]
 
 
 @register

@@ -215,7 +215,7 @@ ROWS = {
     "command_deadband": Row("elbow_motor", {"width": 0.1}, {"width": 0.02}),
     "command_gain": Row("shoulder_motor", {"change": -0.15}, {"change": 0.0}),
     "servo_gain": Row("servo", {"change": -0.2}, {"change": 0.1}, model=SERVOS),
-    "servo_damping": Row("servo", {"less": 0.4}, {"less": 0.1}, model=SERVOS),
+    "servo_damping": Row("servo", {"change": -0.4}, {"change": 0.1}, model=SERVOS),
     "command_saturation": Row("shoulder_motor", {"inverse_limit": 1.6}, {"inverse_limit": 1.2}),
     "backlash": Row("elbow_motor", {"half_width": 0.15}, {"half_width": 0.05}),
     "actuator_lag": Row("shoulder_motor", {"time_constant": 0.05}, {"time_constant": 0.01}),
@@ -551,9 +551,9 @@ def test_a_servos_gains_are_its_kp_and_kv() -> None:
     def softer(m: mujoco.MjModel) -> None:
         m.actuator_gainprm[0, 0], m.actuator_biasprm[0, 1:3] = 15, (-15, -0.5)
 
-    stiffness, damping = LIBRARY["servo_gain"], LIBRARY["servo_damping"]
-    assert stiffness.places(SERVOS) == damping.places(SERVOS) == ["servo"]
-    got = one_step(SERVOS, [stiffness("servo", change=-0.25), damping("servo", less=0.5)])
+    names = ("servo_gain", "servo_damping")
+    assert [LIBRARY[name].places(SERVOS) for name in names] == [["servo"]] * 2
+    got = one_step(SERVOS, [LIBRARY[name]("servo", change=change) for name, change in zip(names, (-0.25, -0.5))])
     np.testing.assert_array_equal(got, one_step(edited(SERVOS, softer), []))
     assert not np.allclose(got, one_step(SERVOS, []))
 
@@ -601,7 +601,7 @@ def test_a_softer_ground_has_the_contacts_of_softer_bodies(geom: str) -> None:
     assert got[1].min() < got[0].min() - 1e-3  # it gives way
 
 
-DIMENSIONLESS = {"share", "mu", "mu_driving", "mu_driven", "change", "along", "softness", "damping", "less"}
+DIMENSIONLESS = {"share", "mu", "mu_driving", "mu_driven", "change", "along", "softness", "damping"}
 
 
 @pytest.mark.parametrize("kind", ROWS)
