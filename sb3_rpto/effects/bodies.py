@@ -310,8 +310,6 @@ class GeomFriction(Effect):
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
         """Geoms that may touch another with friction."""
-        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
-            return []
         names = object_names(model, "geom")
         return [names[g] for g in range(model.ngeom) if any(_may_slip(model, g, h) for h in range(model.ngeom))]
 
@@ -345,8 +343,6 @@ class ContactSoftness(Effect):
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
         """Geoms of the world that may touch another, with a time constant: not with stiffness and damping instead."""
-        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
-            return []
         names = object_names(model, "geom")
         still = (model.body_weldid[model.geom_bodyid] == 0) & (model.geom_solref[:, 0] > 0)
         geoms = [g for g in range(model.ngeom) if still[g]]
@@ -358,7 +354,9 @@ class ContactSoftness(Effect):
 
 
 def _may_touch(model: mujoco.MjModel, g: int, h: int) -> bool:
-    """Whether two geoms collide by their bits and their bodies can move against each other."""
+    """Whether two geoms collide, by the model's flags and their bits, and their bodies can move against each other."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        return False
     bits = (model.geom_contype[g] & model.geom_conaffinity[h]) | (model.geom_contype[h] & model.geom_conaffinity[g])
     one, other = (int(model.body_weldid[model.geom_bodyid[i]]) for i in (g, h))
     parent = model.body_weldid[model.body_parentid]

@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_rpto.effects.actuation import GAINS, servo_of
 from sb3_rpto.effects.effect import Effect, Parameter, register
-from sb3_rpto.effects.names import object_names
+from sb3_rpto.effects.names import object_id, object_names
 from sb3_rpto.effects.world import World
 
 LONGEST_DELAY = 0.2  # s; a longer delay is a fault of the log
@@ -158,8 +158,8 @@ class ServoGain(Effect):
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
         """Position servos."""
-        ids = {name: i for i, name in enumerate(object_names(model, "actuator"))}
-        return [name for name in super().places(model) if servo_of(model, ids[name]) == "position"]
+        every = super().places(model)
+        return [name for name in every if servo_of(model, object_id(model, "actuator", name)) == "position"]
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Scale the gain and what it takes back."""
@@ -185,8 +185,8 @@ class ServoDamping(Effect):
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
         """Position servos that damp."""
-        damps = dict(zip(object_names(model, "actuator"), model.actuator_biasprm[:, 2] != 0))
-        return [name for name in ServoGain.places(model) if damps[name]]
+        servos = ServoGain.places(model)
+        return [name for name in servos if model.actuator_biasprm[object_id(model, "actuator", name), 2]]
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Scale the feedback of the speed."""

@@ -68,8 +68,10 @@ class Job:
 
 def fits(job: Job) -> bool:
     """Whether the robot has a place for what is put in: not all of them touch a ground."""
+    if job.kind not in KINDS or LIBRARY[job.kind].place != "geom":
+        return True
     robot: Any = gym.make(job.robot).unwrapped
-    return job.kind not in KINDS or bool(LIBRARY[job.kind].places(robot.model))
+    return bool(LIBRARY[job.kind].places(robot.model))
 
 
 def make_target(job: Job) -> tuple[gym.Env, list[Effect]]:
