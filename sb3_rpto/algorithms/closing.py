@@ -17,7 +17,7 @@ from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.renewal import outdated, renew_source
 from sb3_rpto.algorithms.rounds import Rounds, learn_for_a_step
 from sb3_rpto.dynamics.base import Transitions
-from sb3_rpto.dynamics.physical import PhysicalDynamics
+from sb3_rpto.dynamics.physical import TRIAL_STATES, TRIAL_STEPS, PhysicalDynamics
 from sb3_rpto.effects import Declared, from_json
 from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import single_env
@@ -25,7 +25,6 @@ from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.adequacy import SETTLED
 from sb3_rpto.tracing.contacts import OFTEN, contact_changes
 from sb3_rpto.tracing.prepare import Progress
-from sb3_rpto.tracing.report import Traced
 from sb3_rpto.tracing.zeros import Zeros
 
 if TYPE_CHECKING:
@@ -48,10 +47,6 @@ NOISY_WINDOW, SHORT_STRETCHES = 6, 0.25
 ENOUGH = 400
 #: What is found is kept when the one-step error falls below this share of the best without it.
 WORTH = 0.9
-#: Width of a normal distribution's 95 % interval, in standard deviations.
-WIDTH = 3.92
-#: A corrected simulator must stay finite for so many steps from states of the target, as the uncorrected one does.
-TRIAL_STATES, TRIAL_STEPS = 16, 20
 
 
 class LoopCloser:
@@ -305,10 +300,17 @@ class LoopCloser:
         logger.record("gap/adequacy_before", report.adequacy_before.ratio)
         logger.record("gap/adequacy_after", report.adequacy_after.ratio)
         logger.record("gap/verdict", report.verdict)
-        logger.record("gap/effects", ", ".join(added) or "none", exclude="tensorboard")
+        logger.record("gap/effects", ", ".join(added) or "none")
+        assert isinstance(model.dynamics, PhysicalDynamics)  # what was traced
+        for name, value in model.dynamics.describe().items():
+            logger.record(f"dynamics/{name}", value)
         model.dump_logs()  # SB3 waits for the end of some episodes, before which a short run is over
         if model.verbose:
             print(f"traced on {data}: {report.verdict}; {', '.join(added) or 'nothing'} added")
+        doubtful = {"undetermined"} if report.verdict == "unexplained" else {"undetermined", "at its bound"}
+        doubts = [f"{f.where}: {f.message}" for f in report.findings if f.kind in doubtful]
+        if doubts and model._traces_log:  # of transitions the fits say so
+            warnings.warn(f"the trace on {data}: {'. '.join(doubts)}", stacklevel=3)
         if report.verdict == "unexplained":
             known = model.measured is not None or model.dynamics_kwargs.get("observation_noise") is not None
             steps = "".join(f". {f.message}" for f in report.findings if f.kind == "time step")
@@ -350,7 +352,7 @@ class LoopCloser:
         kept = dynamics.effects(), dynamics.deviations()
         declared = [effect for effect in dynamics.effects() if isinstance(effect, Declared)]
         dynamics.replace(declared, dynamics.deviations())
-        dynamics.adopt(found, {traced.label: deviation_of(traced) for traced in all_traced})
+        dynamics.adopt(found, {traced.label: traced.deviation for traced in all_traced})
         assert model.env is not None
         if not stays_finite(dynamics, data, model.env):
             dynamics.replace(*kept)
@@ -361,9 +363,18 @@ class LoopCloser:
             )
             self.accounts = False
             return []
-        if before < math.inf and not dynamics.error(data) < (WORTH if new else 1.0) * before:
+        after = dynamics.error(data) if before < math.inf else 0.0
+        if not after < (WORTH if new else 1.0) * before:
             dynamics.replace(*kept)
-            self.accounts &= not new  # what it lacks is known, and it goes on lacking it
+            if new:  # what it lacks is known, and it goes on lacking it
+                self.accounts = False
+                warnings.warn(
+                    f"the trace found {', '.join(new)}, with which the one-step error of {len(data)} target "
+                    f"transitions is {after:.3g}, not clearly below {before:.3g} without: the last simulator is kept; "
+                    "what is rare may hardly count in that error, see print(model.loop.reports[-1]), and "
+                    "dynamics_kwargs={'effects': [...]} adds it all the same",
+                    stacklevel=4,
+                )
             return []
         self.keeps_phi = dynamics.observation_noise is not None or late
         assert model.dynamics_config is not None
@@ -414,12 +425,6 @@ def window(measured: Measurements, contacts: float) -> int:
     return min(max(usual, WINDOW), NOISY_WINDOW)
 
 
-def deviation_of(traced: Traced) -> np.ndarray:
-    """Standard deviation of the parameters that its interval is worth, (p,); infinite where the interval is unknown."""
-    low, high = traced.interval
-    return np.nan_to_num((high - low) / WIDTH, nan=np.inf)
-
-
 def stays_finite(dynamics: PhysicalDynamics, data: Transitions, env: VecEnv) -> bool:
     """Whether the simulator runs on from states of the target under the target's own actions.
 
@@ -428,13 +433,7 @@ def stays_finite(dynamics: PhysicalDynamics, data: Transitions, env: VecEnv) -> 
     :param data: transitions of the target, oldest first
     :param env: the source
     """
-    if not len(data):
-        return dynamics.runs(*_from_resets(env))
-    count = max(1, len(data) - TRIAL_STEPS)
-    first = np.unique(np.linspace(0, count - 1, TRIAL_STATES).astype(int))
-    rows = np.minimum(first[:, None] + np.arange(min(TRIAL_STEPS, len(data))), len(data) - 1)
-    observations, actions = data.observations.cpu().numpy(), data.actions.cpu().numpy()
-    return dynamics.runs(observations[first], actions[rows])
+    return dynamics.runs_on(data) if len(data) else dynamics.runs(*_from_resets(env))
 
 
 def _from_resets(env: VecEnv) -> tuple[np.ndarray, np.ndarray]:

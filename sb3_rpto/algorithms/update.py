@@ -175,19 +175,22 @@ class RelativeUpdate(SAC):
         self._doubt_the_target(data, error)
 
     def fit_weights(self, data: Transitions) -> th.Tensor | None:
-        """RTO's weight of each transition, (n,); None weighs all alike."""
+        """RTO's weight of each transition, (n,), 0 of those too old to be fitted; None weighs all alike."""
         if self.weighting is None:
             return None
         assert self.dynamics is not None
-        return rto_weights(
+        newest = self.dynamics.fits_newest
+        older = 0 if newest is None else max(0, len(data) - newest)
+        weights = rto_weights(
             self.weighting,
-            self._with_critic_rewards(data),
+            self._with_critic_rewards(data.take(slice(older, None))),
             self.dynamics,
             self.soft_value,
             self.q_value,
             self.gamma,
             self.weight_floor,
         )
+        return F.pad(weights, (older, 0))
 
     def _adopt_target_rules(self) -> None:
         """From the first fit on the model is one of the target: let what is known of the task be the target's."""

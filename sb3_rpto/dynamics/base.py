@@ -55,6 +55,8 @@ class Dynamics(nn.Module, ABC):
 
     #: how the source world is rolled out: one-step branches from given states, or whole episodes
     rollout: ClassVar[Literal["branches", "episodes"]]
+    #: :meth:`fit` takes so many of the newest transitions; None: all
+    fits_newest: ClassVar[int | None] = None
 
     optimizer: th.optim.Optimizer
     #: a backend with branches: false until phi_0 is fitted to the source

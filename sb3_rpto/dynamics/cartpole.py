@@ -29,8 +29,6 @@ DECLARABLE: dict[str, tuple[float, float] | None] = {
     "pole_friction": (0.0, 0.5),
 }
 
-#: Only the newest transitions are fitted: a handful of constants is known long before.
-MAX_TRANSITIONS = 5000
 #: Directions whose curvature is below this share of the largest count as not identified by the data.
 SINGULAR = 1e-8
 
@@ -115,6 +113,7 @@ class CartPoleDynamics(Dynamics):
     """
 
     rollout: ClassVar[Literal["branches", "episodes"]] = "episodes"
+    fits_newest: ClassVar[int] = 5000  # a handful of constants is known long before
 
     _lower: th.Tensor
     _upper: th.Tensor
@@ -226,7 +225,7 @@ class CartPoleDynamics(Dynamics):
     ) -> dict[str, float]:
         """Move phi towards ``data`` by at most ``max_steps`` bounded steps; stops where no step improves.
 
-        :param data: transitions, oldest first; the newest :data:`MAX_TRANSITIONS` with a positive weight are used
+        :param data: transitions, oldest first; the newest :attr:`fits_newest` with a positive weight are used
         :param weights: (n,), one non-negative weight a transition; None weighs all alike
         :param max_steps: cap of steps; None takes the constructor's
         :return: ``loss`` (mean weighted squared error after the fit), ``steps`` taken, and for every declared constant
@@ -367,7 +366,7 @@ def _checked_data(data: Transitions, weights: th.Tensor | None) -> tuple[Transit
         raise ValueError(f"weights must have shape ({len(data)},), one a transition, not {tuple(weights.shape)}")
     if not (weights >= 0).all() or not weights.isfinite().all() or not (weights > 0).any():
         raise ValueError("weights must be finite, non-negative and not all zero (and data not empty)")
-    counted = weights.nonzero()[-MAX_TRANSITIONS:, 0]
+    counted = weights.nonzero()[-CartPoleDynamics.fits_newest :, 0]
     data, weights = data.take(counted), weights[counted].double()
     for name in ("observations", "actions", "next_observations"):
         if not getattr(data, name).isfinite().all():

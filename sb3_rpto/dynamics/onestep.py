@@ -23,8 +23,9 @@ MEMORY, FILTERED = 0.2, 10
 DIFFERENCES = (1e-2, 1e-3, 1e-4)
 #: Shares of the trusted size that a step may have.
 REACHES = 0.25 ** np.arange(5)
-#: A parameter that moves no residual by this share of the typical one, for a change by its scale, is not identified.
-UNSEEN = 1e-3
+#: A parameter that moves no residual by this share of the typical one, for a change by its scale, is not identified,
+#: nor is one whose standard error is more than this many of its scales.
+UNSEEN, VAGUE = 1e-3, 1.0
 #: Contacts make local optima: the loss turns linear at so many typical residuals, so that a missed touch-down is borne.
 CLIP = 3.0
 #: Residuals of what blows up, in standard one-step changes.
@@ -41,6 +42,7 @@ class Steps:
     :param drive: the commands, some from before each step
     :param reached: positions and velocities after the step, (n, nq + nv)
     :param scale: standard change in one step of those, (nq + nv,); inf where nothing moves or is known
+    :param unobserved: which positions and speeds no observation tells, (nq + nv,)
     """
 
     rows: np.ndarray
@@ -49,6 +51,7 @@ class Steps:
     drive: Drive
     reached: np.ndarray
     scale: np.ndarray
+    unobserved: np.ndarray
 
     def __len__(self) -> int:
         return len(self.qpos)
@@ -114,7 +117,7 @@ def as_steps(
     spread = (reached - begun).std(axis=0) if len(rows) else np.zeros(len(ever))
     qpos, qvel = np.split(begun, [model.nq], axis=1)
     scale = np.where(ever & (spread > 1e-8), np.maximum(spread, 1e-8), np.inf)
-    return Steps(rows, qpos, qvel, Drive(drive, earlier * frame_skip, hold=frame_skip), reached, scale)
+    return Steps(rows, qpos, qvel, Drive(drive, earlier * frame_skip, hold=frame_skip), reached, scale, ~ever)
 
 
 def remembered(model: mujoco.MjModel, frame_skip: int) -> int:
@@ -170,8 +173,9 @@ class OneStep:
         share = np.ones(len(steps)) if weights is None else weights.cpu().numpy().astype(float)[steps.rows]
         self.share = share / share.sum()
         self.clip = 1.0
-        #: parameters that the transitions did not show at the last step, (p,)
+        #: parameters that the transitions did not show at the last step, and those found :meth:`vague`, (p,)
         self.unseen = np.zeros(len(scale), dtype=bool)
+        self.left = np.zeros(len(scale), dtype=bool)
         #: parameters that the transitions show, but do not tell apart, and those of them that stay, (p,)
         self.entangled = np.zeros(len(scale), dtype=bool)
         self.held = np.zeros(len(scale), dtype=bool)
@@ -232,7 +236,7 @@ class OneStep:
         a, b = self._weighted(residual, slopes)
         shown = _shown(a, b)
         self.unseen &= ~shown
-        free = np.flatnonzero(shown & ~self.held)
+        free = np.flatnonzero(shown & ~self.held & ~self.left)
         size = np.sqrt((a**2).sum(axis=0))
         moved = values.copy()
         if len(free):
@@ -260,16 +264,39 @@ class OneStep:
 
         Infinite for what the transitions do not show or tell apart.
         """
+        spread = self._spread(*self._curvature(values), ~self.held & ~self.left) * self.scale
+        return np.where(self.unseen | self.entangled, np.inf, spread)
+
+    def vague(self, values: np.ndarray) -> np.ndarray:
+        """Parameters that the transitions show, if at all, too faintly to tell: :data:`VAGUE`; (p,).
+
+        One after the other, the vaguest first: of two that act almost alike the other may be told given the one.
+        """
+        curvature, free = self._curvature(values), ~self.held & ~self.left & ~self.unseen
+        found = self.unseen.copy()
+        while free.any():
+            spread = np.where(free, self._spread(*curvature, free), 0.0)
+            worst = int(np.argmax(spread))
+            if not spread[worst] > VAGUE:
+                break
+            free[worst], found[worst] = False, True
+        return found
+
+    def _curvature(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of the cost at phi, in scales: about its Hessian (p, p), and each transition's part of its slope (n, p)."""
         residual, slopes = self.linearise(values, DIFFERENCES[1])
         robust = self.robust(residual)
         hessian = np.einsum("nc,ncp,ncq->pq", robust, slopes, slopes)
-        scores = np.einsum("nc,ncp,nc->np", robust, slopes, residual)
-        free = np.flatnonzero((np.diag(hessian) > 0) & ~self.held)
-        inverse = np.linalg.pinv(hessian[np.ix_(free, free)], rcond=1e-10, hermitian=True)
-        scores = scores[:, free]
-        spread = np.full(len(values), np.inf)
-        spread[free] = np.sqrt(np.maximum(np.diag(inverse @ (scores.T @ scores) @ inverse), 0.0)) * self.scale[free]
-        return np.where(self.unseen | self.entangled, np.inf, spread)
+        return hessian, np.einsum("nc,ncp,nc->np", robust, slopes, residual)
+
+    def _spread(self, hessian: np.ndarray, scores: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """Standard deviations in scales where only the ``free`` ones move; infinite for others and without slope."""
+        moving = np.flatnonzero((np.diag(hessian) > 0) & free)
+        inverse = np.linalg.pinv(hessian[np.ix_(moving, moving)], rcond=1e-10, hermitian=True)
+        meat = scores[:, moving].T @ scores[:, moving]
+        spread = np.full(len(free), np.inf)
+        spread[moving] = np.sqrt(np.maximum(np.diag(inverse @ meat @ inverse), 0.0))
+        return spread
 
 
 def _shown(a: np.ndarray, b: np.ndarray) -> np.ndarray:

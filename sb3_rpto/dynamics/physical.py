@@ -20,16 +20,17 @@ from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.effect import from_json
 from sb3_rpto.effects.mjcf import PlainModel
+from sb3_rpto.effects.model import ModelSource, load_model
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.copies import copy_env
-from sb3_rpto.envs.observations import StateMap, noise_of_each, single_env
+from sb3_rpto.envs.observations import StateMap, noise_of_each, single_env, whole_state
 
-#: Fits use the newest transitions: a few numbers are known long before.
-MAX_TRANSITIONS = 500
 #: A fit stops when no parameter moves by more than this share of its scale.
 STILL = 1e-6
+#: A simulator must stay finite for so many steps from states of the target, and below what MuJoCo takes for such.
+TRIAL_STATES, TRIAL_STEPS, LARGEST = 16, 20, mujoco.mjMAXVAL
 
 
 class PhysicalDynamics(Dynamics):
@@ -51,8 +52,10 @@ class PhysicalDynamics(Dynamics):
 
     :param observation_space: the environment's
     :param action_space: the environment's; actions are the commands of the actuators
-    :param model: the simulator's model
-    :param recover: states from observations, see :func:`sb3_rpto.envs.observations.state_map`
+    :param model: the simulator's model: the path or text of an MJCF, or as :func:`sb3_rpto.effects.model.load_model`
+        takes it
+    :param recover: states from observations, see :func:`sb3_rpto.envs.observations.state_map`; None: observations are
+        states, qpos and then qvel, NaN where one is not known
     :param frame_skip: simulation steps in one step of the environment
     :param declared: names of the model's numbers to train, as :func:`sb3_rpto.effects.declare` takes them
     :param effects: further effects to train, as :meth:`~sb3_rpto.effects.effect.Effect.to_json` describes them
@@ -69,6 +72,7 @@ class PhysicalDynamics(Dynamics):
     """
 
     rollout: ClassVar[Literal["branches", "episodes"]] = "episodes"
+    fits_newest: ClassVar[int] = 500  # a few numbers are known long before
 
     _values: th.Tensor
     _deviation: th.Tensor
@@ -78,9 +82,9 @@ class PhysicalDynamics(Dynamics):
         observation_space: spaces.Box,
         action_space: spaces.Box,
         *,
-        model: mujoco.MjModel | PlainModel,
-        recover: StateMap,
-        frame_skip: int,
+        model: ModelSource | PlainModel,
+        recover: StateMap | None = None,
+        frame_skip: int = 1,
         declared: Sequence[str] = (),
         effects: Sequence[Mapping[str, Any]] = (),
         max_step: float = 0.1,
@@ -100,10 +104,15 @@ class PhysicalDynamics(Dynamics):
         for name, value in (("max_steps", max_steps), ("threads", threads)):
             if not isinstance(value, Integral) or isinstance(value, bool) or value < 0:
                 raise ValueError(f"{name} must be an integer that is not negative, not {value!r}")
-        if isinstance(model, PlainModel):
-            model = model.compile()
+        model = model.compile() if isinstance(model, PlainModel) else load_model(model)[1]
+        recover = whole_state(model.nq, model.nv) if recover is None else recover
         if action_space.shape != (model.nu,):
             raise ValueError(f"action_space has shape {action_space.shape}, the model {model.nu} actuators")
+        if observation_space.shape != (recover.width,):
+            raise ValueError(
+                f"observation_space has shape {observation_space.shape}, and states are recovered from {recover.width} "
+                "numbers; give recover= for observations that are not qpos and qvel"
+            )
         self.model, self.recover, self.frame_skip = model, recover, frame_skip
         self.max_step, self.max_steps, self.randomise = max_step, max_steps, randomise
         self.threads = threads
@@ -196,7 +205,15 @@ class PhysicalDynamics(Dynamics):
         values = np.tile(self.values, (len(observations), 1))
         self.simulation.undo_sensors(values, qpos, qvel)
         q, v = self.simulation.rollout(values, qpos, qvel, Drive(commands, hold=self.frame_skip))
-        return bool(np.isfinite(q).all() and np.isfinite(v).all())
+        with np.errstate(invalid="ignore"):  # comparisons with what is not a number are false
+            return bool((np.abs(q) < LARGEST).all() and (np.abs(v) < LARGEST).all())
+
+    def runs_on(self, data: Transitions) -> bool:
+        """Whether the simulator runs on from states of ``data``, oldest first, under their own actions."""
+        count = max(1, len(data) - TRIAL_STEPS)
+        first = np.unique(np.linspace(0, count - 1, TRIAL_STATES).astype(int))
+        rows = np.minimum(first[:, None] + np.arange(min(TRIAL_STEPS, len(data))), len(data) - 1)
+        return self.runs(data.observations.cpu().numpy()[first], data.actions.cpu().numpy()[rows])
 
     def declared_at_bounds(self) -> list[str]:
         """Names and values of declared numbers that have moved to a bound."""
@@ -301,7 +318,8 @@ class PhysicalDynamics(Dynamics):
         :param data: transitions, of which the newest with a positive weight are fitted
         :param weights: (n,), RTO's, not negative; None weighs all alike
         :param max_steps: default: that of the class
-        :return: ``steps`` taken, and how many transitions were ``left_out`` (clipped or unknown states)
+        :return: ``steps`` taken, how many transitions were ``left_out`` (a state that is clipped or not known), and how
+            many positions and speeds are ``unobserved``, in no observation, and not compared
         :raises ValueError: weights of another shape, negative ones, or such that are not finite
         """
         if weights is not None and weights.shape != (len(data),):
@@ -309,29 +327,48 @@ class PhysicalDynamics(Dynamics):
         if weights is not None and not (weights.isfinite() & (weights >= 0)).all():
             raise ValueError("weights must be finite and not negative")
         counted = np.arange(len(data)) if weights is None else np.flatnonzero(weights.cpu().numpy())
-        steps = self._steps(data, counted[-MAX_TRANSITIONS:])
-        left_out = float(min(len(counted), MAX_TRANSITIONS) - len(steps))
+        steps = self._steps(data, counted[-self.fits_newest :])
+        counts = {"unobserved": float(steps.unobserved.sum())}
+        counts["left_out"] = float(min(len(counted), self.fits_newest) - len(steps))
         if not steps.compared.any() or not len(self.names):
-            return {"steps": 0.0, "left_out": left_out}
-        values, taken = self.values.copy(), 0
+            return {"steps": 0.0, **counts}
+        begin, most = self.values.copy(), self.max_steps if max_steps is None else max_steps
         problem = OneStep(self.simulation, self.scale, self.simulation.lower, self.simulation.upper, steps, weights)
-        problem.hold_what_is_not_determined(values)
-        for _ in range(self.max_steps if max_steps is None else max_steps):
+        problem.hold_what_is_not_determined(begin)
+        values, taken = self._descend(problem, begin, most)
+        vague = problem.vague(values)
+        while (values != begin)[vague].any():  # what the data do not tell has moved: without it, from the start
+            problem.left |= vague
+            values, taken = self._descend(problem, begin, most)
+            vague = problem.vague(values)
+        self._values.copy_(th.as_tensor(values))
+        if taken and not self.runs_on(data):
+            self._values.copy_(th.as_tensor(begin))
+            warnings.warn(
+                "the simulator as it was fitted to the target's data becomes unstable: refused, the last one is kept; "
+                "give bounds to what you declare",
+                stacklevel=3,
+            )
+            return {"steps": 0.0, **counts}
+        self._deviation.copy_(th.as_tensor(problem.deviation(values)))
+        self._name_unseen(problem.left | vague)
+        self._name_entangled(problem.entangled, problem.held)
+        return {"steps": float(taken), **counts}
+
+    def _descend(self, problem: OneStep, values: np.ndarray, most: int) -> tuple[np.ndarray, int]:
+        """At most ``most`` trusted steps from ``values`` on: where they lead, and how many they were."""
+        for taken in range(most):
             moved = problem.step(values, self.max_step)
             if moved is None:
-                break
+                return values, taken
             change = float(np.max(np.abs(moved - values) / self.scale))
-            values, taken = moved, taken + 1
+            values = moved
             if change < STILL:
-                break
-        self._values.copy_(th.as_tensor(values))
-        self._deviation.copy_(th.as_tensor(problem.deviation(values)))
-        self._name_unseen(problem.unseen)
-        self._name_entangled(problem.entangled, problem.held)
-        return {"steps": float(taken), "left_out": left_out}
+                return values, taken + 1
+        return values, most
 
     def _name_unseen(self, unseen: np.ndarray) -> None:
-        """Warn once of parameters that the data do not show."""
+        """Warn once of parameters that the data do not show, or too faintly."""
         names = self._which(unseen)
         _warn_of_new(
             names,
@@ -339,7 +376,7 @@ class PhysicalDynamics(Dynamics):
             f"the target's data do not show {', '.join(names)}: left at what it was; do not declare it, or move so "
             "that it matters",
         )
-        self._unseen = names
+        self._unseen = tuple(dict.fromkeys([*self._unseen, *names]))  # with more data they may come and go
 
     def _name_entangled(self, entangled: np.ndarray, held: np.ndarray) -> None:
         """Warn once of parameters that the data do not tell apart."""

@@ -78,6 +78,20 @@ class StateMap:
         return States(qpos, qvel, known_qpos, known_qvel, *[*states][4:])
 
 
+def whole_state(nq: int, nv: int) -> StateMap:
+    """The map of observations that are the state itself, positions and then speeds; NaN where one is not known.
+
+    :param nq: number of positions
+    :param nv: number of speeds
+    """
+    return StateMap("a model alone", (nq, nv), nq + nv, partial(_split, nq))
+
+
+def _split(nq: int, observations: np.ndarray) -> States:
+    qpos, qvel = observations[:, :nq], observations[:, nq:]
+    return States(qpos, qvel, np.isfinite(qpos), np.isfinite(qvel))
+
+
 _NO_MAP = (
     "register_state_map for {} was not given what makes a state map: a function of the environment that returns the "
     "function of observations"

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 #: Of ``report.json``.
 FORMAT = 1
+#: Width of a normal distribution's 95 % interval, in standard deviations.
+WIDTH = 3.92
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,12 @@ class Traced:
     def label(self) -> str:
         """Kind and place."""
         return self.effect.label
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviations that the intervals are worth, (p,); infinite where an interval is unknown."""
+        low, high = self.interval
+        return np.nan_to_num((high - low) / WIDTH, nan=np.inf)
 
     def __str__(self) -> str:
         parts = []

@@ -167,6 +167,9 @@ def test_a_trace_is_logged_before_any_episode_ends(soon: None, tmp_path: Path) -
     assert line["gap/verdict"] == "complete"
     assert line["gap/effects"] == "none"
     assert float(line["gap/residual_after"]) < 1e-3 < float(line["gap/residual_before"])
+    assert float(line["dynamics/pole.length"]) == pytest.approx(dynamics(made).values[0], rel=1e-6)
+    (events,) = tmp_path.glob("events*")
+    assert b"gap/effects" in events.read_bytes()
 
 
 def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -483,6 +486,25 @@ def test_data_that_have_lost_their_past_are_not_another_simulators() -> None:
     assert outdated(made, dynamics(made))
 
 
+def test_weights_are_normalised_over_what_is_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = filled([], 60, weighting="value_aware", weight_floor=0.25)
+    monkeypatch.setattr(PhysicalDynamics, "fits_newest", 20)
+    data = made.transitions("target")
+    weights = made.fit_weights(data)
+    assert weights is not None
+    assert weights.shape == (len(data),)
+    assert (weights[:-20] == 0).all()
+    fitted = weights[-20:]
+    assert (fitted.min().item(), fitted.max().item()) == pytest.approx((0.25, 1.25))
+    th.manual_seed(0)
+    weights = made.fit_weights(data)
+    th.manual_seed(0)
+    alone = made.fit_weights(data.take(slice(-20, None)))
+    assert weights is not None
+    assert alone is not None
+    assert th.equal(weights[-20:], alone)
+
+
 def test_an_unstable_correction_is_refused(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     made = filled(friction())
     before = dynamics(made).describe()
@@ -501,7 +523,8 @@ def test_what_does_not_lower_the_error_is_refused_and_the_simulator_judges_nothi
     monkeypatch.setattr(closing, "WORTH", 0.0)
     made = filled(friction())
     assert made.loop is not None
-    made.loop.close(made, dynamics(made))
+    with pytest.warns(UserWarning, match=r"found coulomb_friction\(slider\), with which .* last simulator is kept"):
+        made.loop.close(made, dynamics(made))
     assert made.loop.found[-1]["verdict"] == "explained"
     assert dynamics(made).names == ["pole.length"]
     assert not made.loop.accounts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import importlib
 import warnings
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from conftest import SMALL_ENSEMBLE, SMALL_POLICY
 from stable_baselines3 import SAC
+from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPTO, RTO
 from sb3_rpto.algorithms import closing, renewal
@@ -24,6 +26,7 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.tracing import Measurements, windows
+from sb3_rpto.tracing.checks import Finding
 
 TASK, DT = "InvertedPendulum-v5", 0.04
 RATE, EVERY = 0.01, 4  # s between samples, samples between decisions
@@ -301,6 +304,29 @@ def test_what_does_not_explain_a_log_joins_phi_where_it_helps_at_all(
         made.learn(40, source_timesteps=0)
     assert ("torque_offset(slider).offset" in made.dynamics.names) == joins
     assert (made.dynamics.values[0] == pytest.approx(DAMPING, rel=0.1)) == joins
+
+
+@pytest.mark.parametrize(("verdict", "times"), [("complete", 1), ("unexplained", 0)])
+def test_what_a_log_does_not_tell_is_said_and_phi_is_logged(
+    verdict: str, times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vague = [
+        Finding("undetermined", "declared cart.friction", "these data do not tell it"),
+        Finding("at its bound", "declared hinge.damping", "2 is its bound"),
+    ]
+    report = dataclasses.replace(learned().loop.reports[0], verdict=verdict, findings=vague)
+    monkeypatch.setattr(closing, "trace", lambda *_, **__: report)
+    made = model(log(pushed=True), RTO, close_loop=["torque_offset"])
+    made.set_logger(configure(str(tmp_path), ["csv"]))
+    with pytest.warns(UserWarning, match="these data do not tell it") as said:
+        made.learn(10, source_timesteps=0)
+    messages = [str(warning.message) for warning in said]
+    assert sum("5 recorded episodes: declared cart.friction: these data do not tell it" in m for m in messages) == 1
+    assert sum("do not tell it. declared hinge.damping: 2 is its bound" in m for m in messages) == times
+    assert sum("2 is its bound" in m for m in messages) == 1
+    lines = list(csv.DictReader((tmp_path / "progress.csv").open()))
+    (value,) = {line["dynamics/hinge.damping"] for line in lines if line["dynamics/hinge.damping"]}
+    assert float(value) == pytest.approx(made.dynamics.values[0], rel=1e-6)
 
 
 def test_source_steps_are_counted_and_old_ones_dropped() -> None:

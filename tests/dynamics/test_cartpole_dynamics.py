@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_rpto.dynamics.base import Transitions
-from sb3_rpto.dynamics.cartpole import DECLARABLE, MAX_TRANSITIONS, CartPoleDynamics, cartpole_constants
+from sb3_rpto.dynamics.cartpole import DECLARABLE, CartPoleDynamics, cartpole_constants
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
 
 SOURCE = ContinuousCartPoleEnv()
@@ -176,7 +176,7 @@ def test_loss_never_rises_even_with_steps_too_long():
 
 def test_the_newest_transitions_are_fitted():
     old, new = collect(50), collect(100, pole_length=1.1)
-    new = Transitions(*(getattr(new, k).repeat_interleave(MAX_TRANSITIONS // 100, 0) for k in vars(new)))
+    new = Transitions(*(getattr(new, k).repeat_interleave(CartPoleDynamics.fits_newest // 100, 0) for k in vars(new)))
     both = Transitions(*(th.cat([getattr(old, k), getattr(new, k)]) for k in vars(old)))
     assert model().fit(both)["pole_length"] == pytest.approx(1.1, abs=1e-5)
 

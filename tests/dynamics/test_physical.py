@@ -7,6 +7,7 @@ import warnings
 from contextlib import nullcontext
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 import torch as th
@@ -14,10 +15,11 @@ from gymnasium import spaces, wrappers
 from shifted import HOPPER, POLE, POLES, SHIFTS, collect, joined, noisy, shifted
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.env import DynamicsEnv
-from sb3_rpto.dynamics.physical import MAX_TRANSITIONS, PhysicalDynamics
+from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.simulator import physical_config
-from sb3_rpto.effects import Declared
+from sb3_rpto.effects import LIBRARY, Declared
 from sb3_rpto.effects.commands import CommandDelay, CommandGain
 from sb3_rpto.effects.friction import StribeckFriction
 from sb3_rpto.effects.sensors import SensorBias
@@ -221,8 +223,10 @@ def test_speeds_at_the_bound_are_left_out_and_counted():
 
 
 def test_the_newest_transitions_are_fitted():
-    old = collect(gym.make(POLE), MAX_TRANSITIONS, seed=3, scale=0.05)
-    delayed = collect(shifted(POLE, {}, [CommandDelay("slide", delay=0.07)]), MAX_TRANSITIONS, seed=4, scale=0.1)
+    old = collect(gym.make(POLE), PhysicalDynamics.fits_newest, seed=3, scale=0.05)
+    delayed = collect(
+        shifted(POLE, {}, [CommandDelay("slide", delay=0.07)]), PhysicalDynamics.fits_newest, seed=4, scale=0.1
+    )
     model = dynamics(POLE, [], effects=[CommandDelay("slide", delay=0.068).to_json()])
     assert model.fit(joined(old, delayed), max_steps=4)["left_out"] == 0
     assert model.values[0] == pytest.approx(0.07, abs=1e-6)
@@ -302,6 +306,72 @@ def test_the_deviation_shrinks_with_the_data():
         **dict(zip(SHIFTS[POLE], model.values)),
         **{f"{name}_se": d for name, d in zip(SHIFTS[POLE], model.deviation)},
     }
+
+
+def test_what_is_too_faint_to_tell_is_named_and_stays_where_it_was():
+    data = noisy(collect(shifted(HOPPER), 60), 0.1)
+    model = dynamics(HOPPER, ["*.mass", "*.armature"])
+    before = model.values.copy()
+    with pytest.warns(UserWarning, match="do not show .*rootx.armature, rootz.armature.*: left at what it was"):
+        model.fit(data)
+    left = np.isinf(model.deviation)
+    assert 0 < left.sum() < len(left)
+    np.testing.assert_array_equal(model.values[left], before[left])
+    assert (model.values[~left] != before[~left]).all()
+    assert (model.deviation[~left] < model.scale[~left]).all()
+
+
+def test_a_fit_that_makes_the_simulator_unstable_is_refused(monkeypatch):
+    data = collect(shifted(POLE), 60)
+    model = dynamics(POLE)
+    before = model.describe()
+    monkeypatch.setattr(model, "runs_on", lambda _: model.values[0] == before["pole.mass"])
+    with pytest.warns(UserWarning, match="becomes unstable: refused, the last one is kept; give bounds"):
+        assert model.fit(data)["steps"] == 0
+    assert model.describe() == before
+
+
+@pytest.mark.parametrize("stiffness", [1e9, 1e14])
+def test_a_simulator_that_blows_up_does_not_run_on(stiffness):
+    data = collect(gym.make(POLE), 30)
+    model = dynamics(POLE)
+    assert model.runs_on(data)
+    model.adopt([LIBRARY["spring"]("hinge", stiffness=stiffness)])
+    assert not model.runs_on(data)
+
+
+PENDULUM = """
+<mujoco><option timestep="0.01"/><worldbody><body><joint name="hinge" axis="0 1 0" damping="0.1"/>
+<geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/></body></worldbody>
+<actuator><motor name="motor" joint="hinge" gear="2"/></actuator></mujoco>
+"""
+
+
+@pytest.mark.parametrize(("env_id", "count"), [("Pusher-v5", 4), ("Reacher-v5", 0)])
+def test_what_no_observation_tells_is_counted(env_id, count):
+    model = dynamics(env_id, ["*.damping"])
+    assert model.fit(collect(gym.make(env_id), 20), max_steps=1)["unobserved"] == count
+
+
+@pytest.mark.parametrize("form", ["text", "file", "spec"])
+def test_an_mjcf_alone_is_fitted_to_its_states(form, tmp_path):
+    path = tmp_path / "pendulum.xml"
+    path.write_text(PENDULUM)
+    model = {"text": PENDULUM, "file": path, "spec": mujoco.MjSpec.from_string(PENDULUM)}[form]
+    env = mujoco.MjModel.from_xml_string(PENDULUM.replace('damping="0.1"', 'damping="0.15"'))
+    state, rng, rows = mujoco.MjData(env), np.random.default_rng(0), []
+    for _ in range(50):
+        before, state.ctrl[0] = np.concatenate([state.qpos, state.qvel]), rng.uniform(-1, 1)
+        command = state.ctrl.copy()
+        mujoco.mj_step(env, state, 2)
+        rows.append((before, command, 0.0, np.concatenate([state.qpos, state.qvel]), 0.0))
+    data = Transitions(*(th.as_tensor(np.array(column)) for column in zip(*rows)))
+    states, commands = spaces.Box(-np.inf, np.inf, (2,)), spaces.Box(-1, 1, (1,))
+    fitted = PhysicalDynamics(states, commands, model=model, frame_skip=2, declared=["hinge.damping"])
+    fitted.fit(data)
+    assert fitted.describe()["hinge.damping"] == pytest.approx(0.15, rel=1e-6)
+    with pytest.raises(ValueError, match=r"shape \(3,\), and states are recovered from 2 numbers; give recover="):
+        PhysicalDynamics(spaces.Box(-1, 1, (3,)), commands, model=model)
 
 
 # --- effects in phi ---------------------------------------------------------------------------------------------------
