@@ -38,6 +38,8 @@ RISEN = 2.0
 ROUNDING = 1e-6
 #: And, where the last one did not account for everything, when there are so many times as many transitions.
 MORE = 2
+#: Findings that say what would account for the target in place of effects.
+OTHERWISE = {"time step", "early response", "exchanged", "reversed"}
 #: Samples in a window: several steps show what acts late, and contacts do not amplify errors yet.
 WINDOW = 4
 #: What is missing grows with the square of the time, noise does not: where there is some and no contacts come and go,
@@ -313,14 +315,14 @@ class LoopCloser:
             warnings.warn(f"the trace on {data}: {'. '.join(doubts)}", stacklevel=3)
         if report.verdict == "unexplained":
             known = model.measured is not None or model.dynamics_kwargs.get("observation_noise") is not None
-            steps = "".join(f". {f.message}" for f in report.findings if f.kind == "time step")
+            others = "".join(f". {f.message}" for f in report.findings if f.kind in OTHERWISE)
             bounds = "".join(f". {f.where}: {f.message}" for f in report.findings if f.kind == "at its bound")
             noise = "" if known else "whether they are noisy (dynamics_kwargs={'observation_noise': ...}), "
             warnings.warn(
                 f"the trace on {data} is 'unexplained': what it looked for does not account for the difference, and "
                 "the policy learns in a simulator that still errs; see print(model.loop.reports[-1]) for which joints, "
                 f"and whether the observations hold the model's joints in its order, {noise}what else could be "
-                f"declared, and dynamics='residual'{steps}{bounds}",
+                f"declared, and dynamics='residual'{others}{bounds}",
                 stacklevel=3,
             )
 

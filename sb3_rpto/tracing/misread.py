@@ -70,18 +70,18 @@ def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
             speeds = _exchanged(len(columns.qvel), columns.qvel.index(one), columns.qvel.index(other))
             where, what = f"qpos.{one}, qpos.{other}", f"with the positions of {one} and {other} exchanged"
             again = _reordered(order, speeds)
-            yield Reading("exchanged", where, what, "exchange the columns", again, order)
+            yield Reading("exchanged", where, what, "exchange them", again, order)
             if len(motors[i]) == len(motors[j]) == 1:
                 (k,), (m,) = motors[i], motors[j]
                 where += f", ctrl.{columns.ctrl[k]}, ctrl.{columns.ctrl[m]}"
                 what = f"with {one} and {other} exchanged, positions and commands"
                 both = _in_turn(again, _told(_exchanged(len(columns.ctrl), k, m)))
-                yield Reading("exchanged", where, what, "exchange the columns", both, order)
+                yield Reading("exchanged", where, what, "exchange them", both, order)
     for i, j in combinations(range(len(columns.ctrl)), 2):
         one, other = columns.ctrl[i], columns.ctrl[j]
         where, what = f"ctrl.{one}, ctrl.{other}", f"with the commands of {one} and {other} exchanged"
         again = _told(_exchanged(len(columns.ctrl), i, j))
-        yield Reading("exchanged", where, what, "exchange the columns", again, positions)
+        yield Reading("exchanged", where, what, "exchange them", again, positions)
     for i in scalar:
         name, speed = columns.qpos[i], columns.qvel.index(columns.qpos[i])
         what, remedy = f"with the sign of {name} reversed", "let the column count as the model's axis does"
@@ -97,8 +97,6 @@ def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
 def misread(found: Found, set_up: SetUp) -> list[Finding]:
     """The way of reading by which the model errs far less, with what was found for it as far as that is needed then."""
     data, train = set_up.fitted, found.on.fine.train
-    if data.exact or data.noise is not None:  # transitions, whose states the environment's map tells
-        return []
     simulation, horizon, model = train.simulation, found.on.fine.horizon, found.selection.model
     free = found.on.fine.free(model.effects)
 

@@ -188,6 +188,37 @@ def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPat
         made.loop.close(made, dynamics(made))
 
 
+class Unseen(gym.Env):
+    """A machine that shows no MuJoCo model, and whose observations hold its two hinges in the other order."""
+
+    def __init__(self) -> None:
+        self.env = target([])
+        self.observation_space, self.action_space = self.env.observation_space, self.env.action_space
+
+    @staticmethod
+    def shown(observation: np.ndarray) -> np.ndarray:
+        return observation[[0, 2, 1, 4, 3, 5, 7, 6, 8]]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self.shown(observation), info
+
+    def step(self, action: np.ndarray) -> Any:
+        observation, *rest = self.env.step(action)
+        return self.shown(observation), *rest
+
+
+def test_joints_in_another_order_are_found(soon: None) -> None:
+    made = model([], target_env=Unseen(), close_loop=[], retrain_steps=0)
+    with pytest.warns(
+        UserWarning, match="'unexplained'.*with the positions of hinge and hinge2 exchanged the model errs"
+    ):
+        made.learn(90, source_timesteps=0)
+    assert made.loop is not None
+    (found,) = [f for f in made.loop.reports[0].findings if f.kind == "exchanged"]
+    assert found.where == "qpos.hinge, qpos.hinge2"
+
+
 @pytest.mark.slow
 def test_an_empty_list_traces_the_declared_numbers_alone(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     began = []
