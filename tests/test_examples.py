@@ -134,7 +134,11 @@ def test_close_the_loop_names_what_is_in_the_target(monkeypatch, tmp_path, capsy
     assert out.index("verdict:") < out.index("what the simulator did not know") < out.index("return, zero-shot")
     assert "not there" not in out
     curves = pd.read_csv(tmp_path / "closed_loop_0_0.csv")
-    assert curves.groupby("method").steps.max().to_dict() == {"RPTO, loop closed": 202, "SAC, fine-tuned": 202}
+    last = curves.groupby("method").last()
+    assert last.steps.to_dict() == {"RPTO, loop closed": 202, "RPTO, loop open": 202, "SAC, fine-tuned": 202}
+    assert last["return"].notna().all()
+    before, after = last.source_error, last.model_error
+    assert after["RPTO, loop closed"] < 1e-3 < 0.01 < after["RPTO, loop open"] < before["RPTO, loop open"]
     assert (tmp_path / "closed_loop.png").exists()
 
 

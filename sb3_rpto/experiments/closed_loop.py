@@ -176,6 +176,13 @@ def make_source(task: str) -> gym.Env:
     return gym.make(TASKS[task].env_id)
 
 
+def true_numbers(task: str, shift: str, target: int) -> dict[str, float]:
+    """What the declared numbers are in a target, by their names; where nothing differs, what they are in the source."""
+    model = make_source(task).unwrapped.model  # type: ignore[attr-defined]
+    numbers = [*declare(model, TASKS[task].declared), *shifted(task, shift, target)]
+    return {e.label: float(e.values[0]) for e in numbers if isinstance(e, Declared)}
+
+
 def make_target(task: str, shift: str, target: int, sensors: float = 0.0, seed: int = 0) -> gym.Env:
     """A target of a task, observed with noise as of :class:`Job` that follows from a seed."""
     source = make_source(task)
@@ -236,7 +243,7 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
         if job.sensors and "close_loop" in kwargs:
             noise = sensor_noise(job.task, make_source(job.task), job.sensors)
             kwargs["dynamics_kwargs"] = {"observation_noise": noise.tolist()}
-    truth = {e.label: float(e.values[0]) for e in shifted(job.task, job.shift, job.target) if isinstance(e, Declared)}
+    truth = true_numbers(job.task, job.shift, job.target)
     rows = transfer(
         method,
         agent,

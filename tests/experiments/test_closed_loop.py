@@ -48,6 +48,13 @@ def test_an_undeclared_friction_is_its_share_of_the_motors_peak() -> None:
     assert effects["coulomb_friction(bthigh)"].values[0] == pytest.approx(0.12 * model.actuator_gear[0, 0])
 
 
+def test_the_truth_of_an_unchanged_target_is_what_the_source_has() -> None:
+    same, other = study.true_numbers("hopper", "none", 0), study.true_numbers("hopper", "declared", 0)
+    assert set(same) == set(other)
+    assert same["leg.length"] == pytest.approx(0.5)
+    assert all(0 < abs(other[name] / value - 1) <= 0.2 for name, value in same.items())
+
+
 def test_an_unfinished_study_is_a_fair_sample() -> None:
     listed = study.jobs(["hopper"], study.SHIFTS, study.TARGETS, range(2))
     assert len(listed) == len({job.name for job in listed}) == 3 * 2 * 2 * len(study.METHODS)
