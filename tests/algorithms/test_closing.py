@@ -342,7 +342,7 @@ def test_a_late_sensor_is_taken_into_phi_by_the_reports_word() -> None:
     late = LIBRARY["sensor_delay"]("hinge", delay=0.09)
     made = filled([late])
     data = made.transitions("target")
-    traced = SimpleNamespace(effect=late, label=late.label, interval=np.array([[0.08], [0.1]]))
+    traced = SimpleNamespace(effect=late, label=late.label, deviation=np.array([0.005]))
     report = SimpleNamespace(declared=(), effects=(traced,), verdict="explained")
     assert made.loop is not None
     assert made.loop._take(made, dynamics(made), report, data, before=1e-3) == [late.label]  # type: ignore[arg-type]
@@ -621,7 +621,7 @@ def test_a_new_target_is_traced_anew(soon: None) -> None:
 
 def explanation(effects: list[Effect], verdict: str = "explained", zeros: Zeros | None = None) -> SimpleNamespace:
     """What a trace would report."""
-    traced = tuple(SimpleNamespace(effect=e, label=e.label, interval=np.stack([e.values, e.values])) for e in effects)
+    traced = tuple(SimpleNamespace(effect=e, label=e.label, deviation=0 * e.values) for e in effects)
     ratio = SimpleNamespace(ratio=1.0)
     said = {"verdict": verdict, "declared": (), "effects": traced, "zeros": zeros}
     return SimpleNamespace(adequacy_before=ratio, adequacy_after=ratio, **said)

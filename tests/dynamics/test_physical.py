@@ -204,7 +204,7 @@ def test_data_that_say_nothing_change_nothing(pole, case):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         log = model.fit(data.get(case, pole), th.zeros(60) if case == "no weight" else None)
-    assert log == {"steps": 0.0, "left_out": 0.0}
+    assert log == {"steps": 0.0, "unobserved": 0.0, "left_out": 0.0}
     np.testing.assert_array_equal(model.values, before)
     np.testing.assert_array_equal(model.deviation, 0)
 
@@ -218,7 +218,7 @@ def test_speeds_at_the_bound_are_left_out_and_counted():
     assert model.fit(wrong, max_steps=8)["left_out"] == 4
     assert model.values[0] == pytest.approx(0.55, rel=1e-3)
     wrong.observations[:, 5:] = 10.0
-    assert model.fit(wrong) == {"steps": 0.0, "left_out": 60.0}
+    assert model.fit(wrong) == {"steps": 0.0, "unobserved": 1.0, "left_out": 60.0}
     assert np.isnan(model.error(wrong))
 
 
