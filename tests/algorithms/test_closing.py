@@ -623,7 +623,7 @@ def explanation(effects: list[Effect], verdict: str = "explained", zeros: Zeros 
     """What a trace would report."""
     traced = tuple(SimpleNamespace(effect=e, label=e.label, deviation=0 * e.values) for e in effects)
     ratio = SimpleNamespace(ratio=1.0)
-    said = {"verdict": verdict, "declared": (), "effects": traced, "zeros": zeros}
+    said = {"verdict": verdict, "declared": (), "effects": traced, "zeros": zeros, "findings": []}
     return SimpleNamespace(adequacy_before=ratio, adequacy_after=ratio, **said)
 
 
