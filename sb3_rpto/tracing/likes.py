@@ -21,6 +21,8 @@ MERGES = 3
 #: Candidates for a substitution are the likest so many, of at least this cosine; of a kind that is nowhere kept, which
 #: could stand in all places, at least the second.
 SUBSTITUTES, LIKE, AKIN = 5, 0.3, 0.6
+#: Of two that meet exact data the one that errs by less than this share is right, if the other errs by so much.
+RIGHT, ERRS = 0.01, 0.1
 
 
 class Likes:
@@ -205,6 +207,8 @@ class Likes:
 
     def _better(self, a: Model, b: Model) -> bool:
         """Whether one of two likes does better: near the noise that seems so soon, far from it it must be clear."""
+        if self.selector.met(b) and ERRS < b.fit.errors.max() > a.fit.errors.max() / RIGHT:
+            return True
         far = self.selector.far(a)
         return self.selector.evidence(a, b).clear(*(self.selector.limit(a) if far else (SEEMS, GAIN)))
 

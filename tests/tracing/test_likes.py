@@ -5,7 +5,7 @@ from simulated import compiled, problem, recorded
 
 from sb3_rpto.effects.commands import ActuatorLag, CommandDelay
 from sb3_rpto.effects.effect import Effect
-from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction, ViscousFriction
+from sb3_rpto.effects.friction import CoulombFriction, SoftFriction, StribeckFriction, ViscousFriction
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.screen import screen
 from sb3_rpto.tracing.select import THRESHOLD, Selection, Selector
@@ -46,6 +46,22 @@ def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
     rich = s.led_on(s.model([1], s.train.fit(s.train.null, s.free([1]))))
     assert not s.far(rich)
     assert Likes(s, found).simplest(rich, Selection(rich)).effects == (0,)
+
+
+def test_of_two_that_meet_exact_data_the_one_that_errs_far_less_is_right() -> None:
+    """A friction that gives way for a moment is a Coulomb's within the tolerance of exact data."""
+    effects: list[Effect] = [CoulombFriction("hinge"), SoftFriction("hinge")]
+    data = recorded([SoftFriction("hinge", level=0.08)], noise=0.0, exact=True)
+    s = Selector(problem(effects, data, noise=1e-3), None, THRESHOLD, lambda share, what: None)
+    nothing = s.train.score(s.train.null)
+    dry, soft = (s.led_on(s.model([i], nothing, 12)) for i in (0, 1))
+    assert s.met(dry)
+    assert s.met(soft)
+    found = Likes(s, screen(s.train, nothing)).substitute(Selection(dry))
+    assert found.model.effects == (1,)
+    assert found.alike[1] == [0]
+    again = Likes(s, screen(s.train, nothing)).substitute(Selection(soft))
+    assert again.model.effects == (1,)
 
 
 @pytest.mark.slow
