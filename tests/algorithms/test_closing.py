@@ -108,11 +108,12 @@ def test_a_report_is_told_before_the_policy_learns_in_what_it_corrects() -> None
 
 
 @pytest.mark.slow
-def test_a_target_with_frictionloss_alone_is_explained(soon: None) -> None:
+def test_a_target_with_frictionloss_alone_is_explained(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody who sets it by hand makes it hold as a machine's does."""
+    monkeypatch.setattr(closing, "FIRST", 160)  # in fewer it turns too seldom to show that it gives way
     shifted = target([])
     shifted.unwrapped.model.dof_frictionloss[0] = LEVEL  # type: ignore[attr-defined]
-    made = model([], target_env=shifted, close_loop=[*KINDS, "soft_friction"]).learn(81, source_timesteps=4)
+    made = model([], target_env=shifted, close_loop=[*KINDS, "soft_friction"]).learn(161, source_timesteps=4)
     assert made.loop is not None
     report: Report = made.loop.reports[0]
     assert report.verdict == "explained"
