@@ -350,8 +350,9 @@ class PhysicalDynamics(Dynamics):
                 stacklevel=3,
             )
             return {"steps": 0.0, **counts}
+        problem.left |= vague
         self._deviation.copy_(th.as_tensor(problem.deviation(values)))
-        self._name_unseen(problem.left | vague)
+        self._name_unseen(problem.left)
         self._name_entangled(problem.entangled, problem.held)
         return {"steps": float(taken), **counts}
 
