@@ -30,6 +30,7 @@ from sb3_rpto.algorithms.renewal import outdated, renew_source
 from sb3_rpto.algorithms.rounds import Rounds
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.dynamics.physical import PhysicalDynamics
+from sb3_rpto.dynamics.weights import rto_weights
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.tracing import Measurements, Report, trace
@@ -535,6 +536,28 @@ def test_weights_are_normalised_over_what_is_fitted(monkeypatch: pytest.MonkeyPa
     assert weights is not None
     assert alone is not None
     assert th.equal(weights[-20:], alone)
+
+
+@pytest.mark.parametrize("weighting", ["paper", "centred", "value_aware", None])
+def test_a_fit_has_the_weights_that_were_asked_for(weighting: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = filled([], 30, weighting=weighting, weight_floor=0.25, gamma=0.9)
+    fitted = []
+    monkeypatch.setattr(dynamics(made), "fit", lambda data, weights: fitted.append(weights) or {})
+    data = made.transitions("target")
+    th.manual_seed(3)
+    made._fit_to_transitions()
+    th.manual_seed(3)
+    alive = 1 - data.terminations.float()
+    if weighting == "value_aware":
+        raw = rto_weights("value_aware", data, dynamics(made), made.soft_value, made.q_value, 0.9, 0.25)
+    else:
+        raw = data.rewards + 0.9 * alive * made.soft_value(data.next_observations)
+        raw = (raw - made.q_value(data.observations, data.actions) if weighting == "centred" else raw) ** 2
+        raw = (raw - raw.min()) / (raw.max() - raw.min()) + 0.25
+    (weights,) = fitted
+    assert (weights is None) == (weighting is None)
+    if weights is not None:
+        th.testing.assert_close(weights, raw)
 
 
 def test_an_unstable_correction_is_refused(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
