@@ -206,7 +206,10 @@ class Likes:
         return replace(model.fit, values=np.clip(values, train.lower, train.upper), linear=None)
 
     def _better(self, a: Model, b: Model) -> bool:
-        """Whether one of two likes does better: near the noise that seems so soon, far from it it must be clear."""
+        """Whether one of two likes does better: near the noise that seems so soon, far from it it must be clear.
+
+        Where the other meets exact data, one that is far nearer still is right, though no window denies the other.
+        """
         if self.selector.met(b) and ERRS < b.fit.errors.max() > a.fit.errors.max() / RIGHT:
             return True
         far = self.selector.far(a)
