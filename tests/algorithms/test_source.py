@@ -1,0 +1,213 @@
+"""Step 3: what is stored of branches and of episodes in the source."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import SMALL_POLICY, small
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_rpto import RPO, RPTO
+from sb3_rpto.algorithms.source import BranchSource
+from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions
+from sb3_rpto.effects import declare
+from sb3_rpto.envs.corrected import apply_effects
+
+BOUND, WALL = 4.0, 2.0
+LOW, HIGH = np.array([-1.0, -2.0], np.float32), np.array([3.0, 2.0], np.float32)
+POLE = "InvertedPendulum-v5"
+
+
+class Point(gym.Env):
+    """A point that each action moves by itself; its actions' bounds are nobody's [-1, 1]."""
+
+    observation_space = spaces.Box(-BOUND, BOUND, (2,))
+    action_space = spaces.Box(LOW, HIGH)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.place, self.steps = self.np_random.uniform(-1, 1, 2).astype(np.float32), 0
+        return self.place, {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.steps += 1
+        self.place = np.clip(self.place + action, -BOUND, BOUND).astype(np.float32)
+        return self.place, float(self.place.sum()), False, self.steps >= 5, {}
+
+
+class Push(Dynamics):
+    """The same as a model, which knows no bounds, and ends beyond a wall."""
+
+    rollout = "branches"
+
+    def step(self, observations: th.Tensor, actions: th.Tensor, deterministic: bool = False) -> Prediction:
+        """See the class."""
+        reached = observations + actions
+        return Prediction(reached, reached.sum(dim=1), reached[:, 0] > WALL)
+
+    def fit(self, data: Transitions, weights: Any = None, max_steps: int | None = None) -> dict[str, float]:
+        """Nothing is to be learned."""
+        return {}
+
+    def error(self, data: Transitions) -> float:
+        """None."""
+        return 0.0
+
+
+def algorithm(env: Any = None) -> RPTO:
+    """One whose branches may start from places of the source, all in [-1, -0.5], or of the target, in [0.5, 1]."""
+    made = small(RPTO, Point() if env is None else env, Point())
+    rng = np.random.default_rng(0)
+    made.replay_buffer.source_starts = rng.uniform(-1, -0.5, (300, 2)).astype(np.float32)
+    places = rng.uniform(0.5, 1, (300, 2)).astype(np.float32)
+    made.replay_buffer.append("target", places, places, np.zeros((300, 2)), np.zeros(300), np.zeros(300))
+    return made
+
+
+def branches(made: RPTO, n: int, start: Any = "target") -> dict[str, np.ndarray]:
+    """So many, as they were stored."""
+    push = Push(made.observation_space, made.action_space)
+    assert BranchSource(push, start).interact(made, n) == n
+    side = made.replay_buffer.source
+    assert side.size() == n
+    names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+    return {name: getattr(side, name)[:n, 0] for name in names}
+
+
+def test_branches_are_stored_as_the_model_answers_them() -> None:
+    stored = branches(algorithm(), 400)
+    actions = LOW + (stored["actions"] + 1) / 2 * (HIGH - LOW)
+    assert (np.ptp(stored["actions"], axis=0) > 1).all()
+    reached = stored["observations"] + actions
+    assert (reached > 2.5).any()  # and so beyond the wall
+    np.testing.assert_allclose(stored["next_observations"], reached, atol=1e-6)
+    np.testing.assert_allclose(stored["rewards"], reached.sum(axis=1), atol=1e-5)
+    np.testing.assert_array_equal(stored["dones"] > 0, reached[:, 0] > WALL)
+    assert 0 < stored["dones"].mean() < 1
+    assert not stored["timeouts"].any()
+
+
+def test_what_a_model_says_beyond_the_observations_bounds_is_at_them() -> None:
+    made = algorithm()
+    made.replay_buffer.target.observations[:300] += 3  # now in [3.5, 4]
+    stored = branches(made, 400)
+    actions = LOW + (stored["actions"] + 1) / 2 * (HIGH - LOW)
+    reached = stored["observations"] + actions
+    assert (reached > BOUND).any()
+    np.testing.assert_allclose(stored["next_observations"], reached.clip(-BOUND, BOUND), atol=1e-6)
+    np.testing.assert_allclose(stored["rewards"], reached.sum(axis=1), atol=1e-5)
+
+
+@pytest.mark.parametrize(("start", "of_target"), [("target", 101), ("source", 0), ("mix", 50)])
+def test_branches_start_where_it_was_asked_for(start: str, of_target: int) -> None:
+    made = algorithm()
+    stored = branches(made, 101, start)["observations"]
+    assert (stored[:, 0] > 0).sum() == of_target
+    for pool in (made.replay_buffer.source_starts, made.replay_buffer.target.observations[:300, 0]):
+        begun = {place.tobytes() for place in stored} & {place.tobytes() for place in pool}
+        assert len(begun) > 30 or len(begun) == 0  # anywhere, not at the first ones
+
+
+@pytest.mark.parametrize("start", ["target", "mix"])
+def test_before_the_first_target_transition_branches_start_in_the_source(start: str) -> None:
+    made = algorithm()
+    made.replay_buffer.target.reset()
+    assert (branches(made, 20, start)["observations"] < 0).all()
+
+
+# --- normalisation ----------------------------------------------------------------------------------------------------
+
+
+def far(make: Callable[[], gym.Env], mean: float, variance: float) -> VecNormalize:
+    """Normalised by statistics that are far from nothing, and stay."""
+    env = VecNormalize(make_vec_env(make, n_envs=2), training=False)
+    env.obs_rms.mean += mean  # type: ignore[union-attr]
+    env.obs_rms.var *= variance  # type: ignore[union-attr]
+    env.ret_rms.var *= 25.0  # type: ignore[assignment]
+    return env
+
+
+def test_branches_act_on_what_the_policy_knows_and_are_stored_raw(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = far(Point, 3.0, 4.0)
+    made = algorithm(env)
+    seen, act = [], made.policy._predict
+    monkeypatch.setattr(made.policy, "_predict", lambda obs, **kwargs: (seen.append(obs), act(obs, **kwargs))[1])
+    stored = branches(made, 50)
+    np.testing.assert_allclose(seen[0], (stored["observations"] - 3) / 2, rtol=1e-5)
+    assert (stored["observations"] >= 0.5).all()
+    actions = LOW + (stored["actions"] + 1) / 2 * (HIGH - LOW)
+    np.testing.assert_allclose(stored["rewards"], (stored["observations"] + actions).sum(axis=1), atol=1e-5)
+
+
+def test_episodes_are_stored_raw() -> None:
+    made = small(RPO, far(Point, 3.0, 4.0), Point()).learn(20, source_timesteps=60)
+    for side in (made.replay_buffer.source, made.replay_buffer.target):
+        n = side.size()
+        assert n >= 20
+        np.testing.assert_allclose(side.rewards[:n, 0], side.next_observations[:n, 0].sum(axis=1), atol=1e-5)
+        assert side.observations[:n].max() > 1
+
+
+# --- simulators -------------------------------------------------------------------------------------------------------
+
+
+def heavier() -> gym.Env:
+    env = gym.make(POLE)
+    (mass,) = declare(env.unwrapped.model, ["pole.mass"])  # type: ignore[attr-defined]
+    return apply_effects(env, [mass.with_values(1.2 * mass.values)])
+
+
+def simulators(randomise: float) -> RPTO:
+    """Two, with a mass that is known to a tenth."""
+    made = RPTO(
+        "MlpPolicy",
+        DummyVecEnv([lambda: gym.make(POLE)]),
+        target_env=heavier(),
+        dynamics="physical",
+        declared=["pole.mass"],
+        dynamics_kwargs={"randomise": randomise},
+        source_steps=2,
+        policy_kwargs=SMALL_POLICY,
+        seed=0,
+        device="cpu",
+    )
+    made.learn(1, source_timesteps=40)
+    (mass,) = made.dynamics.effects()  # type: ignore[union-attr]
+    made.dynamics.replace([mass], {mass.label: 0.1 * mass.values})  # type: ignore[union-attr]
+    return made
+
+
+def masses(made: RPTO, n_steps: int = 400) -> tuple[list[set[float]], float]:
+    """Of each simulator those of all of its episodes, and the estimate."""
+    world, seen = made._source_world, [set[float](), set[float]()]
+    for _ in range(n_steps // 2):
+        world.interact(made, 2)  # type: ignore[union-attr]
+        for copy, of in zip(world.copies, seen):  # type: ignore[union-attr]
+            model = copy.unwrapped.model
+            of.add(float(model.body_mass[model.body("pole").id]))
+    (estimate,) = made.dynamics.values  # type: ignore[union-attr]
+    return seen, float(estimate)
+
+
+def test_each_episode_of_a_randomised_simulator_has_a_phi_of_its_own() -> None:
+    made = simulators(1.0)
+    taken = made.replay_buffer.source.size()
+    (one, other), estimate = masses(made)
+    ended = made.replay_buffer.source.dones[taken : made.replay_buffer.source.size(), 0].reshape(-1, 2)
+    episodes = [len(one - {estimate}), len(other - {estimate})]
+    assert episodes == ended.sum(axis=0).tolist()
+    assert min(episodes) > 10
+    assert not (one - {estimate}) & other
+    drawn = np.array(sorted(one | other))
+    assert drawn.std() == pytest.approx(0.1 * estimate, rel=0.4)
+    assert np.median(drawn) == pytest.approx(estimate, rel=0.05)
+
+
+def test_without_that_all_episodes_have_the_estimate() -> None:
+    seen, estimate = masses(simulators(0.0), 100)
+    assert seen == [{estimate}] * 2
