@@ -214,16 +214,50 @@ def test_several_source_environments(cls):
     model.learn(30, source_timesteps=60)
     assert model.num_timesteps == 30
     assert model.get_env().num_envs == 3
+    if cls is RPO:  # the others' source is the model
+        seen, then = (getattr(model.replay_buffer.source, n)[:60, 0] for n in ("observations", "next_observations"))
+        np.testing.assert_array_equal(seen[3:], then[:-3])  # the source phase's, side by side
+        assert (seen[1:] != seen[:-1]).any(axis=1).all()
 
 
-@pytest.mark.slow
+class Better(gym.Wrapper):
+    """Each episode of five steps earns one more a step than the one before, or one less."""
+
+    def __init__(self, by):
+        super().__init__(gym.make("Pendulum-v1", g=12.0, max_episode_steps=5))
+        self.by, self.episodes = by, 0
+
+    def reset(self, **kwargs):
+        self.episodes += 1
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, float(self.by * self.episodes), *rest
+
+
+@pytest.mark.parametrize(("by", "best"), [(1, 5 * (4 + 5 + 6 + 7 + 8) / 5), (-1, -5 * (1 + 2 + 3 + 4 + 5) / 5)])
+def test_the_newest_episodes_judge(by, best):
+    model = small(RPO, target=Better(by)).learn(40, source_timesteps=0)
+    assert model.best_mean_reward == pytest.approx(best)
+
+
+def test_the_worlds_have_starts_of_their_own():
+    model = small(RPO)
+    source, target = model.env.reset(), model.target_env.reset()
+    assert not np.isclose(source, target).any()
+    np.testing.assert_array_equal(target[0], pendulum().reset(seed=10_000)[0])
+
+
 def test_the_best_policy_is_kept_and_can_be_brought_back():
-    model = small(RPO, gradient_steps=1)
-    model.learn(1200, source_timesteps=0)
+    model = small(RPO, target=gym.make("Pendulum-v1", g=12.0, max_episode_steps=20))
+    model.learn(120, source_timesteps=0)
     assert set(model.snapshots) == {"source", "best"}
     assert np.isfinite(model.best_mean_reward)
     now = model.predict(np.ones(3), deterministic=True)[0]
+    assert model.temperature() != 1.0
     model.rollback("source")
+    assert model.temperature() == 1.0
     source = model.predict(np.ones(3), deterministic=True)[0]
     assert not np.allclose(now, source)
     fresh = small(RPO)
@@ -452,7 +486,13 @@ def test_the_source_phase_keeps_more_than_the_transfer_does():
 @pytest.mark.parametrize("cls", [RTO, RPTO])
 @pytest.mark.parametrize("weighting", ["paper", "centred", "value_aware", None])
 def test_every_weighting_runs(cls, weighting):
-    small(cls, weighting=weighting).learn(60, source_timesteps=0)
+    model = small(cls, weighting=weighting)
+    model.set_logger(configure(None, []))
+    model.learn(60, source_timesteps=0)
+    logged = model.logger.name_to_value
+    assert np.isfinite(logged["dynamics/error"])
+    assert logged["dynamics/error"] < logged["dynamics/error_before"]
+    assert ("rto/effective_samples" in logged) == (weighting is not None)
 
 
 class BlowsUp(gym.Wrapper):

@@ -7,13 +7,17 @@ import pytest
 import torch as th
 from conftest import ALGORITHMS, pendulum, small
 from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms.descent import Descent
 from sb3_rpto.algorithms.forward import sample_actions
 from sb3_rpto.algorithms.update import ALTERNATION, GATHERED
+from sb3_rpto.dynamics.base import Transitions
+from sb3_rpto.dynamics.weights import rto_weights
 
 
 def filled_sac(**kwargs) -> SAC:
@@ -111,11 +115,20 @@ def test_the_critics_batch_holds_the_real_ratio_of_target_transitions(cls, ratio
     assert critic_batch.rewards.sum() == expected
 
 
-def test_values_for_the_weights_are_the_target_critics():
-    model = small(RPTO, ent_coef=0.1)
-    observations = th.randn(50, 3)
+def normalised_pendulum() -> VecNormalize:
+    """Observations about a mean of 3 with a standard deviation of 2, rewards a fifth and clipped at 1."""
+    env = VecNormalize(make_vec_env(pendulum), training=False, clip_reward=1.0)
+    env.obs_rms.mean, env.obs_rms.var, env.ret_rms.var = np.full(3, 3.0), np.full(3, 4.0), np.float64(25.0)
+    return env
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_values_for_the_weights_are_the_target_critics(normalised):
+    model = small(RPTO, normalised_pendulum() if normalised else None, ent_coef=0.1)
+    raw = th.randn(50, 3)
+    observations = (raw - 3) / 2 if normalised else raw
     th.manual_seed(0)
-    ours = model.soft_value(observations)
+    ours = model.soft_value(raw)
     th.manual_seed(0)
     with th.no_grad():
         actions, log_prob = model.actor.action_log_prob(observations)
@@ -123,8 +136,28 @@ def test_values_for_the_weights_are_the_target_critics():
     th.testing.assert_close(ours, th.minimum(q1, q2)[:, 0] - 0.1 * log_prob)
     # Pendulum's torque is within 2 N m, the critic sees actions in [-1, 1]
     th.testing.assert_close(
-        model.q_value(observations, 2 * actions), th.minimum(*model.critic_target(observations, actions))[:, 0]
+        model.q_value(raw, 2 * actions), th.minimum(*model.critic_target(observations, actions))[:, 0]
     )
+
+
+@pytest.mark.parametrize("weighting", ["paper", "centred", "value_aware"])
+def test_weights_are_of_rewards_as_the_critic_knows_them(weighting):
+    model = small(RPTO, normalised_pendulum(), weighting=weighting, weight_floor=0.0)
+    model.learn(60, source_timesteps=0)
+    data = model.transitions("target")
+    shown = (data.rewards / 25**0.5).clamp(-1, 1)
+    assert ((shown > -1) & (shown < 0)).any()
+    known = Transitions(data.observations, data.actions, shown, data.next_observations, data.terminations)
+    found = []
+    for each in (
+        model.fit_weights,
+        lambda _: rto_weights(weighting, known, model.dynamics, model.soft_value, model.q_value, model.gamma, 0.0),
+    ):
+        th.manual_seed(0)
+        model.dynamics.seed(0)
+        found.append(each(data))
+    th.testing.assert_close(*found)
+    assert found[0].std() > 0
 
 
 def test_a_policy_that_draws_its_actions_itself_is_asked():

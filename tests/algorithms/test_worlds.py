@@ -64,6 +64,20 @@ def test_buffers_hold_falls_as_they_were_where_normalisation_clips_them(dynamics
         assert (np.abs(side.next_observations[: side.size(), 0, 1][ended]) > FALLEN).all()
 
 
+def test_the_target_is_normalised_as_the_source_is() -> None:
+    settings = {"clip_obs": 0.5, "clip_reward": 0.3, "epsilon": 0.1, "gamma": 0.9}
+    source = VecNormalize(DummyVecEnv([lambda: gym.make(POLE)]), training=False, **settings)  # type: ignore[arg-type]
+    source.obs_rms.mean, source.ret_rms.var = np.full(4, 0.2), np.float64(4.0)  # type: ignore[union-attr]
+    target = small(RPO, source, heavier()).target_env
+    assert isinstance(target, VecNormalize)
+    assert target.gamma == 0.9
+    seen, earned = np.linspace(-1, 1, 40).reshape(10, 4), np.linspace(-2, 2, 10)
+    np.testing.assert_array_equal(target.normalize_obs(seen), source.normalize_obs(seen))
+    np.testing.assert_array_equal(target.normalize_reward(earned), source.normalize_reward(earned))
+    assert np.abs(target.normalize_obs(seen)).max() == 0.5
+    assert target.normalize_reward(earned).max() == 0.3
+
+
 def test_where_the_environments_are_elsewhere_falls_are_what_normalisation_left() -> None:
     source = narrow(SubprocVecEnv([lambda: gym.make(POLE)], start_method="fork"))
     made = small(RPO, source, heavier()).learn(20, source_timesteps=100)
