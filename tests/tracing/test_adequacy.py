@@ -100,6 +100,15 @@ def test_chance_is_the_binomials() -> None:
     assert len(np.unique(p.windows.block[strays])) == 4
 
 
+def test_a_window_is_a_stray_a_quarter_beyond_what_one_in_a_hundred_of_noise_reaches() -> None:
+    p = recordings(0)
+    errors = np.full(len(p.windows), 1.0)
+    edge = np.quantile(p.noise_errors(with_errors(p, errors), 0), 0.99)
+    for times, strays in ((1.24, 0.0), (1.26, 4 / len(errors))):
+        errors[[0, 11, 22, 33]] = times * edge
+        assert adequacy(p, with_errors(p, errors), 0).strays == pytest.approx(strays)
+
+
 def test_a_stalled_window_and_a_stalled_block_are_no_inadequacy() -> None:
     p = recordings(4)
     errors = of_noise(p, 4)

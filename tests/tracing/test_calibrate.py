@@ -27,6 +27,17 @@ def test_what_is_in_the_data_does_not_raise_the_threshold() -> None:
     assert needed(s, base.fit, [0, 1], seed=1) < 5
 
 
+def test_effects_in_what_judges_do_not_raise_the_threshold_either(monkeypatch: pytest.MonkeyPatch) -> None:
+    s, made = selector(0.08), []
+    monkeypatch.setattr(calibrate, "strongest", lambda drawn, base, chosen: (made.append(drawn), 0.0)[1])
+    needed(s, s.model((), s.train.score(s.train.null)).fit, [0, 1], seed=1)
+    (drawn,) = made
+    for problem_, own in ((drawn.train, s.train), (drawn.select, s.select)):
+        assert problem_ is not own
+        # Friction is in none of it: the model without leaves no more than noise.
+        assert np.median(problem_.score(problem_.null).errors) < 1.2 < np.median(own.score(own.null).errors)
+
+
 @pytest.mark.slow
 def test_the_threshold_is_a_quantile_of_the_sets_and_no_less_than_that_of_a_test(monkeypatch) -> None:
     s = selector(0.0)

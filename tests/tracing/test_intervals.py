@@ -2,9 +2,13 @@
 
 import numpy as np
 import pytest
+from simulated import problem, recorded
 
+from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.tracing.identify import Linear
-from sb3_rpto.tracing.intervals import half_widths
+from sb3_rpto.tracing.intervals import half_widths, refit
+from sb3_rpto.tracing.loss import Loss
+from sb3_rpto.tracing.select import Selection, Selector
 
 EVEN, UNEVEN, RARE = np.ones(16), np.geomspace(0.2, 3, 16), np.r_[np.full(12, 0.02), 1.0, 1.2, 0.9, 1.1]
 
@@ -45,3 +49,16 @@ def test_what_a_single_block_tells_has_no_interval() -> None:
     linear = Linear(x[:, :, None] * x[:, None], gradient, np.arange(2))
     assert np.isnan(half_widths(linear, np.arange(16))).tolist() == [False, True]
     assert np.isnan(half_widths(linear, np.zeros(16))).all()
+
+
+def test_intervals_are_as_wide_as_the_curvature_of_the_loss_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    p = problem([CoulombFriction("hinge")], recorded([CoulombFriction("hinge", level=0.05)]))
+    s = Selector(p, p, 3.5, lambda share, what: None)
+    selection, widths = Selection(s.model((0,), p.score(p.null))), []
+    for curvature in (1.0, 0.5):
+        monkeypatch.setattr(Loss, "curvature", lambda loss, r, by=curvature: by)
+        values, intervals = refit(selection, p)
+        assert values[0] == pytest.approx(0.05, rel=0.05)
+        widths.append(np.diff(intervals[:, 0])[0])
+    assert 0 < widths[0] < 0.05
+    assert widths[1] == pytest.approx(2 * widths[0])

@@ -1,5 +1,8 @@
 """Screening: what the data could show, what looks alike, and what the declared parameters could take."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from simulated import WITH_WHEEL, compiled, problem, recorded
@@ -35,6 +38,23 @@ def test_what_delays_commands_is_not_excited_by_constant_ones() -> None:
     assert still.alike(0) == []
     varied, _ = screened(effects, recorded())
     assert all(varied.excited(i) for i in range(4))
+
+
+def test_each_window_has_the_same_say_in_what_looks_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near an unstable pose one window tells a thousand times as much as others do, and there all grows alike."""
+    p = problem([CoulombFriction("hinge"), ViscousFriction("hinge")], recorded())
+    reduce = p.reduce
+
+    def uneven(*args: Any) -> Any:
+        found = reduce(*args)
+        normal = np.tile(np.eye(2), (len(p.windows), 1, 1))
+        normal[0] = 1e3 * np.array([[1.0, 0.999], [0.999, 1.0]])
+        return replace(found, normal=normal)
+
+    monkeypatch.setattr(p, "reduce", uneven)
+    found = screen(p, at_null(p))
+    assert found.cosine[0, 1] == pytest.approx(0.999 / len(p.windows), rel=0.1)
+    assert found.alike(0) == []
 
 
 def test_nothing_about_a_motor_that_gets_no_command_is_excited() -> None:

@@ -105,6 +105,12 @@ def test_clear_takes_more_than_chance_and_more_than_a_trifle() -> None:
     assert not Evidence(-0.5, -9.0, blocks, missed).clear(3.5)
 
 
+def test_below_the_noise_no_model_is_better() -> None:
+    errors, blocks = np.geomspace(0.01, 0.4, 8), np.arange(8)
+    assert compare(errors, errors / 100, blocks).gain == 0.0
+    assert compare(np.full(8, 1.0), errors, blocks).gain == pytest.approx(0.5)  # down to half of it counts
+
+
 def few_missed(errors: list[float], of: int = 20) -> np.ndarray:
     """Errors of so many windows, each a block, of which a few are missed and the others met."""
     return np.r_[errors, np.random.default_rng(0).normal(1.0, 0.02, of - len(errors))]

@@ -186,6 +186,11 @@ def test_verdicts() -> None:
     assert judge(poor, fine, named=True) == "explained"
     assert judge(poor, better, named=True) == "partly explained"
     assert judge(poor, half, named=True) == judge(poor, poor, named=False) == "unexplained"
+    few, fewer, quarter = (Adequacy(r, 0.95, 1.1, s, 1e-4) for r, s in ((1.05, 0.2), (1.05, 0.11), (1.2, 0.05)))
+    assert few.denied_by_strays
+    assert judge(few, replace(fewer, strays=0.1), named=True) == "partly explained"  # half as many of them
+    assert judge(few, fewer, named=True) == "unexplained"
+    assert judge(replace(few, ratio=1.07), quarter, named=True) == "unexplained"  # the typical error is more than noise
 
 
 @pytest.mark.slow
@@ -479,6 +484,28 @@ def test_an_environment_that_does_more_than_its_model_is_told(gain: float, push:
     (found,) = [f for f in report.findings if f.kind == "own step"]
     assert said in found.message
     assert not [f for f in trace(driven(0.0)[0], data, candidates=[], threads=1).findings if f.kind == "own step"]
+
+
+@pytest.mark.parametrize(
+    ("threshold", "verdict"), [(5.0, "explained"), pytest.param(1e9, "unexplained", marks=pytest.mark.slow)]
+)
+def test_a_calibrated_threshold_is_the_one_that_selects(
+    threshold: float, verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def calibrated(selector: Any, base: Any, chosen: list[int], sets: int, seed: int) -> float:
+        asked.append((len(selector.train.simulation.effects), chosen, sets, seed))
+        return threshold
+
+    monkeypatch.setattr("sb3_rpto.tracing.search.calibrated", calibrated)
+    data = recorded([CoulombFriction("hinge", level=0.08)], model=compiled(COARSE), rate=100)
+    settings: dict[str, Any] = {"candidates": ["coulomb_friction"], "horizon": 0.35, "threads": 1}
+    report = trace(COARSE, data, ["hinge.damping"], calibrate=20, seed=3, **settings)
+    assert asked == [(2, [1], 20, 3)]
+    assert report.verdict == verdict
+    if verdict == "explained":  # else a t of 2 is enough: far from the noise other limits hold
+        assert report.threshold == threshold
 
 
 @pytest.mark.parametrize("name", ["seed", "calibrate", "threads"])
