@@ -203,6 +203,14 @@ def test_a_buffer_class_of_the_users_sees_the_infos():
     assert buffer.target.timeouts[1, 0] == 1
 
 
+def test_time_limits_end_episodes_where_nobody_handles_them():
+    buffer = DualReplayBuffer(10, OBS, ACT, device="cpu", handle_timeout_termination=False)
+    for world in ("source", "target"):
+        buffer.append(world, **rows(0, 10))
+        assert not buffer.side(world).timeouts.any()
+        assert chronological(buffer.side(world))["terminations"].tolist() == [0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
+
 @pytest.mark.parametrize("steps", [6, 25])
 def test_transitions_of_a_buffer_that_saves_memory_are_those_that_it_still_knows(steps):
     space = spaces.Box(-np.inf, np.inf, (1,))

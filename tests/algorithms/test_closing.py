@@ -11,7 +11,7 @@ from functools import cache
 from itertools import chain, count, repeat
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -21,6 +21,7 @@ from gymnasium.wrappers import TransformAction
 from queued import Queue
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPTO, RTO
 from sb3_rpto.algorithms import arguments, closing, renewal, rounds
@@ -611,6 +612,51 @@ def test_another_trace_is_due_when_new_transitions_are_no_longer_predicted(
     assert not loop.due(made, dynamics(made))
     append(made, [LIBRARY["torque_offset"]("hinge", offset=2.0)], 30)
     assert loop.due(made, dynamics(made))
+
+
+@pytest.mark.parametrize(("error", "due"), [(1.9, False), (2.1, True)])
+def test_new_transitions_have_to_be_predicted_twice_as_badly_for_another_trace(
+    error: float, due: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = filled(friction(), 120)
+    loop = made.loop
+    assert isinstance(loop, LoopCloser)
+    monkeypatch.setattr(closing, "AGAIN", 20)
+    loop.found, loop._traced_at, loop._error, loop._untraced = [{"verdict": "explained"}], 100, 0.01, False
+    asked = []
+    monkeypatch.setattr(dynamics(made), "error", lambda data: (asked.append(data.observations), 0.01 * error)[1])
+    assert loop.due(made, dynamics(made)) is due
+    th.testing.assert_close(asked[0], made.transitions("target").observations[100:])  # what came since
+
+
+@pytest.mark.parametrize(
+    ("after", "declared", "found"), [(0.95, True, False), (0.85, True, True), (1.01, False, False)]
+)
+def test_effects_have_to_pay_and_declared_numbers_to_be_no_worse(
+    after: float, declared: bool, found: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = filled(friction(), 60)
+    loop, (length,) = made.loop, dynamics(made).effects()
+    assert isinstance(loop, LoopCloser)
+    data = made.transitions("target")
+    monkeypatch.setattr(dynamics(made), "error", lambda _: after)
+
+    def taken(*effects: Effect) -> list[str]:
+        traced = [SimpleNamespace(effect=e, label=e.label, deviation=0 * e.values) for e in effects]
+        fine = SimpleNamespace(ratio=1.0)
+        report = SimpleNamespace(
+            **{"declared": traced[:1], "effects": traced[1:], "verdict": "explained"},
+            **{"adequacy_before": fine, "adequacy_after": fine},
+        )
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=r"the trace found coulomb_friction")
+            loop._take(made, dynamics(made), cast(Report, report), data, before=1.0)
+        return dynamics(made).names
+
+    moved = length.with_values(1.1 * length.values)
+    assert taken(moved) == ["pole.length"]
+    assert (dynamics(made).values[0] == moved.values[0]) is np.bool_(declared)
+    assert ("coulomb_friction(slider).level" in taken(moved, *friction())) is found
 
 
 @pytest.mark.slow
@@ -1352,6 +1398,31 @@ def test_a_rehearsal_plays_the_deterministic_policy_in_the_fitted_simulator(monk
     assert made.source_timesteps - before == rehearsals.steps == 2 * sum(lengths)
     assert not rehearsals.due(made._n_updates)
     assert not rehearsals.is_behind(made)
+
+
+def test_a_rehearsal_lasts_as_long_as_episodes_do_and_shows_the_policy_what_it_knows() -> None:
+    env = VecNormalize(DummyVecEnv([lambda: gym.make("HalfCheetah-v5")]), training=False)
+    env.obs_rms.mean, env.obs_rms.var = np.full(17, 0.3), np.full(17, 4.0)  # type: ignore[union-attr]
+    made = RPTO(
+        *("MlpPolicy", env),
+        **{"target_env": gym.make("HalfCheetah-v5"), "dynamics": "physical", "declared": ["torso.mass", "bfoot.mass"]},
+        **{"close_loop": True, "policy_kwargs": {"net_arch": [16]}, "seed": 0, "device": "cpu"},
+    )
+    rehearsals = Rehearsals()
+    (earned,) = rehearsals._play(made, dynamics(made), range(1))
+    assert rehearsals.steps == made.source_timesteps == 1_000
+    real = gym.make("HalfCheetah-v5")
+    observation, _ = real.reset(seed=30_000)
+    returned = 0.0
+    for _ in range(1_000):
+        action, _ = made.predict(((observation - 0.3) / 2).clip(-10, 10), deterministic=True)
+        observation, reward, *_ = real.step(action)
+        returned += float(reward)
+    assert earned == pytest.approx(returned, rel=1e-3)
+    rehearsals._phi, rehearsals._names = dynamics(made).values.copy(), list(dynamics(made).names)
+    assert not rehearsals._has_moved(dynamics(made))
+    rehearsals._phi[1] *= 1.01  # one of them is enough
+    assert rehearsals._has_moved(dynamics(made))
 
 
 FALLS, SPREAD = np.where(np.arange(100) % 5 == 3, 40.0, 100.0), np.random.default_rng(0).normal(size=100)

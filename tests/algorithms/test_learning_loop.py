@@ -208,6 +208,20 @@ def test_vec_normalize_statistics_are_the_sources_alone():
     assert model.target_env.obs_rms is model.env.obs_rms is not source.obs_rms
 
 
+@pytest.mark.parametrize(("budget", "steps"), [(7, 70), (30_001, 300_000)])
+def test_the_source_phase_is_ten_times_the_budget_and_has_an_end(budget, steps, monkeypatch):
+    asked = []
+
+    def stop(self, source_timesteps, progress_bar):
+        asked.append(source_timesteps)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RPO, "begin_in_source", stop)
+    with pytest.raises(KeyboardInterrupt):
+        small(RPO).learn(budget)
+    assert asked == [steps]
+
+
 @pytest.mark.parametrize("cls", ALGORITHMS)
 def test_several_source_environments(cls):
     model = small(cls, make_vec_env(pendulum, n_envs=3, seed=0), pendulum(12.0))

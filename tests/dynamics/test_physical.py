@@ -483,6 +483,28 @@ def test_the_error_is_in_standard_one_step_changes(poles):
     assert model.error(poles) < 1e-9
 
 
+def test_it_is_tried_all_along_the_transitions_and_for_twenty_steps(poles, monkeypatch):
+    model, tried = dynamics(POLES), []
+    monkeypatch.setattr(model, "runs", lambda observations, actions: (tried.append((observations, actions)), True)[1])
+    assert model.runs_on(poles)
+    ((observations, actions),) = tried
+    assert actions.shape == (16, 20, 1)
+    rows = [np.flatnonzero((poles.observations.numpy() == row).all(axis=1))[0] for row in observations]
+    assert (rows[0], rows[-1]) == (0, len(poles) - 21)
+    assert np.ptp(np.diff(rows)) <= 1
+    for row, given in zip(rows, actions):
+        np.testing.assert_array_equal(given, poles.actions.numpy()[row : row + 20])
+
+
+def test_a_number_that_was_at_its_bound_has_not_moved_there():
+    model = dynamics(POLE, ["slider.frictionloss", "pole.mass=4.5:7.5"])
+    assert model.values[0] == model.simulation.lower[0] == 0.0
+    assert model.declared_at_bounds() == []
+    (loss, mass) = model.effects()
+    model.adopt([loss, mass.with_values(np.array([7.5]))])
+    assert model.declared_at_bounds() == ["pole.mass = 7.5"]
+
+
 def test_steps_need_the_environment():
     with pytest.raises(RuntimeError, match="attach"):
         dynamics(POLE).step(th.zeros(1, 4), th.zeros(1, 1))
