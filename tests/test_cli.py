@@ -76,13 +76,27 @@ def test_effects_are_known_from_a_file(files: Path, capsys: pytest.CaptureFixtur
     assert "--known: there is no file" in error(capsys)
 
 
+def test_options_reach_the_trace(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, object] = {}
+
+    def stop(model: object, data: object, declared: object, **kwargs: object) -> None:
+        asked.update(kwargs)
+        raise ValueError("enough")
+
+    monkeypatch.setattr("sb3_rpto.tracing.trace", stop)
+    options = ["--calibrate", "7", "--horizon", "0.2", "--threads", "1", "--seed", "4", "--quiet"]
+    assert run(files, *options) == 2
+    expected = {"calibrate": 7, "horizon": 0.2, "threads": 1, "seed": 4, "candidates": ["coulomb_friction"]}
+    assert {name: asked[name] for name in expected} == expected
+
+
 def test_a_file_is_no_folder_to_write_to(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (files / "report").write_text("mine")
     assert run(files, "--out", str(files / "report")) == 2
     assert "is a file; give a folder" in error(capsys)
 
 
-def test_bad_input_leaves_no_folder(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_leaves_no_folder(files: Path, tmp_path: Path) -> None:
     rows = (files / "runs.csv").read_text().splitlines()
     (tmp_path / "short.csv").write_text("\n".join(rows[:20]) + "\n")
     arguments = ["trace", str(files / "robot.xml"), str(tmp_path / "short.csv"), "--quiet", "--out"]

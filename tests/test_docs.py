@@ -113,7 +113,7 @@ class Succeeds(gym.Wrapper):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_every_logged_key_is_explained_and_every_explained_key_is_logged(tmp_path, monkeypatch):
+def test_every_logged_key_is_explained_and_every_explained_key_is_logged(monkeypatch):
     keys: set[str] = set()
     for cls in ALGORITHMS:
         evaluation = EvalCallback(Monitor(Succeeds(pendulum(12.0))), eval_freq=210, n_eval_episodes=1, verbose=0)

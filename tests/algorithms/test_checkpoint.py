@@ -736,7 +736,7 @@ def small_from(sac, **kwargs):
     return RPTO.from_source(sac, pendulum(), pendulum(12.0), **settings, **kwargs)
 
 
-def test_a_source_model_that_does_not_fit_is_refused(tmp_path):
+def test_a_source_model_that_does_not_fit_is_refused():
     other = SAC("MlpPolicy", gym.make("MountainCarContinuous-v0"), policy_kwargs=SMALL_POLICY)
     with pytest.raises(ValueError, match="source_model has observation_space"):
         RPTO.from_source(other, pendulum(), pendulum(12.0))

@@ -1202,7 +1202,7 @@ def test_what_the_policy_that_acts_earns_is_the_last_word(capsys: pytest.Capture
     assert capsys.readouterr().out.splitlines()[-1].endswith(f"the best so far, earns {earns} in the simulator")
 
 
-def test_parameters_that_a_user_sets_go_on_learning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parameters_that_a_user_sets_go_on_learning() -> None:
     made = forgetful()
     made.take_snapshot("learner")
     made.set_parameters(made.get_parameters())

@@ -393,7 +393,7 @@ def test_a_run_goes_on_after_a_target_step_that_was_not_finite(tmp_path):
         assert np.isfinite(one.replay_buffer.target.observations[:24]).all()
 
 
-def test_offline_data_stand_in_for_the_target(tmp_path):
+def test_offline_data_stand_in_for_the_target():
     recorder = SAC("MlpPolicy", pendulum(12.0), policy_kwargs={"net_arch": [16]}, learning_starts=300, seed=0).learn(
         300
     )

@@ -385,7 +385,7 @@ def test_with_the_loop_open_the_declared_numbers_alone_are_fitted(monkeypatch: p
     assert not fits
 
 
-def test_networks_learn_from_a_log(tmp_path: Path) -> None:
+def test_networks_learn_from_a_log() -> None:
     made = model(log(), dynamics="ensemble", declared=(), dynamics_kwargs=SMALL_ENSEMBLE)
     size = made.replay_buffer.target.size()
     assert size == 5 * 26

@@ -216,7 +216,7 @@ def test_sb3_leaves_out_what_cannot_be_pickled(cls):
     assert ours_too >= excluded | {"actor", "critic", "critic_target", "target_env", "dynamics", "_last_obs"}
 
 
-def test_optimizers_and_modules_are_saved_by_dotted_names(tmp_path):
+def test_optimizers_and_modules_are_saved_by_dotted_names():
     """``dynamics.optimizer`` relies on SB3's recursive getattr."""
     model = build(RPTO).learn(5, source_timesteps=0)
     names, variables = model._get_torch_save_params()

@@ -45,7 +45,7 @@ def test_a_stage_takes_its_model_steps_and_policy_updates(monkeypatch):
     assert phi_0 == 30
 
 
-def test_rollouts_are_the_models_from_initial_states_of_the_source_cut_off(monkeypatch):
+def test_rollouts_are_the_models_from_initial_states_of_the_source_cut_off():
     model = slbo(model_train_freq=30)
     model.learn(30, source_timesteps=0)
     rollouts = model.trpo.env

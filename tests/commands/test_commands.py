@@ -155,9 +155,7 @@ def test_every_kind_of_method_leaves_model_and_result(method: str, agent: Path, 
     "method",
     ["rpo", "rpto", "sac-mixed", *(pytest.param(name, marks=pytest.mark.slow) for name in ("slbo", "trpo-warm"))],
 )
-def test_a_killed_transfer_goes_on(
-    method: str, agent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_killed_transfer_goes_on(method: str, agent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     killed, unbroken = tmp_path / "killed", tmp_path / "unbroken"
     with monkeypatch.context() as patch:
         interrupt_at(60, patch)
@@ -635,7 +633,7 @@ def test_source_transitions_are_for_methods_with_a_use_for_them(
     assert rows(tmp_path / "rpo")[0]["source_steps"] == 0
 
 
-def test_a_traceback_is_there_for_those_who_ask(agent: Path, tmp_path: Path) -> None:
+def test_a_traceback_is_there_for_those_who_ask(agent: Path) -> None:
     with pytest.raises(ValueError, match="does not exist"):
         cli.main(["--traceback", "transfer", str(agent / "model.zip"), TARGET, "--method", "rtpo", "--out", "x"])
 

@@ -8,6 +8,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from compared import assert_same, fields
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.utils.env_checker import check_env
 from queued import Queue
@@ -17,7 +18,7 @@ from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales
 from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.effect import from_json
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
-from sb3_rpto.effects.model import load_model, numbers
+from sb3_rpto.effects.model import load_model
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.wrapper import CorrectedEnv, beyond_model, corrections
 from sb3_rpto.envs.copies import copy_env
@@ -87,11 +88,6 @@ def actions_for(env, steps, seed=1):
 def run(env, actions, seed=0):
     first, _ = env.reset(seed=seed)
     return [(first,), *(env.step(action) for action in actions)]
-
-
-def assert_same(one, other):
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_equal(a, b)
 
 
 @pytest.mark.parametrize("name", [POLE, "HalfCheetah-v5", "Hopper-v5"])
@@ -324,10 +320,6 @@ def cheetah_effects(model):
 
 
 TASKS = {"Hopper-v5": hopper_effects, "HalfCheetah-v5": cheetah_effects, POLE: effects}
-
-
-def fields(env):
-    return {name: value.copy() for name, value in numbers(env.unwrapped.model).items()}
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -6,12 +6,13 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
+from compared import assert_same, fields
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_rpto.effects import LIBRARY, Declared, Effect, Parameter, declare
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
-from sb3_rpto.effects.model import differing, numbers
+from sb3_rpto.effects.model import differing
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.corrected import apply_effects
@@ -57,15 +58,6 @@ def actions_for(steps, seed=0):
 def run(env, actions, seed=None):
     first = [env.reset(seed=seed)[0]] if seed is not None else []
     return [*first, *(env.step(action) for action in actions)]
-
-
-def assert_same(one, other):
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_equal(a, b)
-
-
-def fields(env):
-    return {name: value.copy() for name, value in numbers(env.unwrapped.model).items()}
 
 
 def test_the_source_is_not_changed():

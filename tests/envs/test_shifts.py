@@ -9,6 +9,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from compared import fields
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_rpto.effects import LIBRARY, Declared
@@ -34,10 +35,6 @@ def run(env, steps=25, seed=0):
     space = env.action_space
     actions = rng.uniform(space.low, space.high, size=(steps, *space.shape)).astype(space.dtype)
     return [env.reset(seed=seed)[0], *(env.step(action) for action in actions)]
-
-
-def fields(env):
-    return {name: value.copy() for name, value in numbers(env.unwrapped.model).items()}
 
 
 # --- exact references -------------------------------------------------------------------------------------------------

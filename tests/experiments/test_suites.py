@@ -183,9 +183,7 @@ SMALL: dict[str, dict[str, Any]] = {
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("suite", [QUICK, ABLATION], ids=["quick", "ablation"])
-def test_every_variant_of_a_small_suite_runs(
-    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-) -> None:
+def test_every_variant_of_a_small_suite_runs(suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_rpto.algorithms.distil.clone.__defaults__", (20,))
     place = suite.places[0]
     make_source = partial(gym.make, env_id(place.task))

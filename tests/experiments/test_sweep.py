@@ -318,7 +318,7 @@ def test_a_missing_backend_names_its_extra(tmp_path: Path, monkeypatch: pytest.M
         sweep.run(SUITE, tmp_path, backend="ray")
 
 
-def test_a_place_has_agents_for_its_task_alone(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_place_has_agents_for_its_task_alone(made: Path, tmp_path: Path) -> None:
     """``--only`` trains no agent and no oracle that its runs do not need."""
     other = Place("InvertedDoublePendulum", ("friction-x20",), PLACE.variants, (20,), "absent", source_steps=10**9)
     both = replace(SUITE, places=(PLACE, other))
