@@ -279,6 +279,17 @@ def test_state_dependent_exploration(cls, train_freq, warmup):
 
 
 @every_class
+@pytest.mark.parametrize("warmup", [False, True])
+def test_until_learning_starts_actions_are_random_or_explore_by_states(cls, warmup):
+    """With next to no noise the policy's own are all near its mean, which an untrained one has near zero."""
+    policy_kwargs = {"net_arch": [8], "log_std_init": -10}
+    model = build(cls, use_sde=True, use_sde_at_warmup=warmup, policy_kwargs=policy_kwargs, learning_starts=20)
+    learn(model, 20, **({} if cls is SAC else {"source_timesteps": 20}))
+    acted = model.replay_buffer if cls is SAC else model.replay_buffer.source
+    assert (np.abs(acted.actions[:20]).max() < 0.7) == warmup
+
+
+@every_class
 def test_exploration_noise_is_redrawn_every_sde_sample_freq_steps(cls):
     model = build(cls, use_sde=True, sde_sample_freq=4, train_freq=12, learning_starts=0)
     watch = Record(lambda model: model.actor.action_dist.exploration_mat[0, 0].item())

@@ -463,6 +463,16 @@ def test_deterministic_is_the_mean_of_the_elites():
     np.testing.assert_allclose(prediction.rewards, mean[:, OBS], atol=1e-4)
 
 
+def test_a_mean_prediction_ends_where_the_elites_think_that_likely(monkeypatch):
+    model = make(termination_fn=None)
+    model.fit(linear(60), max_steps=2)
+    heads = model._ask_elites(th.zeros(4, OBS + ACT, dtype=th.float64).float())
+    likely = th.tensor([0.2, 0.45, 0.55, 0.9]).expand(model.n_elites, 4)[:, :, None]
+    monkeypatch.setattr(model, "_ask_elites", lambda inputs: heads._replace(logit=th.logit(likely)))
+    found = model.step(th.zeros(4, OBS), th.zeros(4, ACT), deterministic=True)
+    assert found.terminations.tolist() == [False, False, True, True]
+
+
 def test_sample_statistics():
     """Moments of the mixture of the elites, at one state."""
     model, data = make(), linear(500)

@@ -203,6 +203,18 @@ def test_the_cost_is_quadratic_for_small_and_linear_for_large_residuals(poles):
     np.testing.assert_allclose(task.cost(residuals), expected, rtol=1e-3)
 
 
+def test_the_least_squares_that_stand_for_the_cost_have_its_slope(poles):
+    task = problem(poles, SHIFTS[POLES], POLES, th.arange(1.0, len(poles) + 1))
+    task.clip = 2.0
+    residuals = np.random.default_rng(0).normal(scale=4.0, size=(len(poles), 6))
+    for row, column in ((0, 0), (3, 5), (17, 2)):
+        up, down = residuals.copy(), residuals.copy()
+        up[row, column] += 1e-5
+        down[row, column] -= 1e-5
+        slope = np.diff(task.cost(np.stack([down, up])))[0] / 2e-5
+        assert 2 * (task.robust(residuals) * residuals)[row, column] / 6 == pytest.approx(slope, rel=1e-4)
+
+
 def test_slopes_are_the_derivatives_by_the_parameters_in_scales(poles):
     task = problem(poles, SHIFTS[POLES], POLES)
     values = task.simulation.null * 1.05
