@@ -230,6 +230,11 @@ class SavedCurve(LearningCurve):
     def _waits(self, steps: int) -> bool:
         return self.after_update or steps == self.total
 
+    def _init_callback(self) -> None:
+        dynamics = getattr(self.model, "dynamics", None)
+        if self.say is not None and dynamics is not None and dynamics.rollout == "branches" and not dynamics.fitted:
+            self.say("the networks learn what the source does first, which may take minutes on a CPU")
+
     def _on_training_start(self) -> None:
         loop = getattr(self.model, "loop", None)
         if loop is not None:

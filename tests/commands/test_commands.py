@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -168,6 +169,18 @@ def test_a_killed_transfer_goes_on(method: str, agent: Path, tmp_path: Path, mon
         assert rows(killed) == rows(unbroken)
         states = [load_policy(out / "model.zip", "MODEL").state_dict() for out in (killed, unbroken)]
         assert all(th.equal(value, states[1][name]) for name, value in states[0].items())
+
+
+@pytest.mark.parametrize(("told", "lines"), [((), 1), (PHYSICAL, 0), (("--quiet",), 0)])
+def test_that_networks_learn_the_source_first_is_said(
+    told: Sequence[str], lines: int, agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = "dynamics_kwargs={hidden: [8], n_members: 2, n_elites: 1, max_steps: 5}"
+    given = ["transfer", str(agent / "model.zip"), TARGET, "--method", "rpto", "--steps", "20", *FEW, *JUDGED[:-1]]
+    networks = [] if told is PHYSICAL else ["--set", "dynamics=ensemble", "--set", network]
+    assert cli.main([*given, *networks, *told, "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert ["networks learn" in line for line in said[:2]].count(True) == lines
 
 
 def test_any_shift_is_a_target(agent: Path, tmp_path: Path) -> None:
