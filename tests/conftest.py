@@ -12,6 +12,8 @@ from hypothesis import settings
 
 from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms import warm
+from sb3_rpto.effects import declare
+from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Report, trace
 
@@ -35,6 +37,13 @@ def _short_source_phase(monkeypatch):
 
 def pendulum(g: float = 10.0) -> gym.Env:
     return gym.make("Pendulum-v1", g=g)
+
+
+def heavier(factor: float = 1.2) -> gym.Env:
+    """An inverted pendulum of another mass."""
+    env = gym.make("InvertedPendulum-v5")
+    (mass,) = declare(env.unwrapped.model, ["pole.mass"])  # type: ignore[attr-defined]
+    return apply_effects(env, [mass.with_values(factor * mass.values)])
 
 
 def small(cls, env=None, target=None, **kwargs):

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import SMALL_POLICY, small
+from conftest import SMALL_POLICY, heavier, small
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -15,8 +15,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_rpto import RPO, RPTO
 from sb3_rpto.algorithms.source import BranchSource
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions
-from sb3_rpto.effects import declare
-from sb3_rpto.envs.corrected import apply_effects
 
 BOUND, WALL = 4.0, 2.0
 LOW, HIGH = np.array([-1.0, -2.0], np.float32), np.array([3.0, 2.0], np.float32)
@@ -154,12 +152,6 @@ def test_episodes_are_stored_raw() -> None:
 
 
 # --- simulators -------------------------------------------------------------------------------------------------------
-
-
-def heavier() -> gym.Env:
-    env = gym.make(POLE)
-    (mass,) = declare(env.unwrapped.model, ["pole.mass"])  # type: ignore[attr-defined]
-    return apply_effects(env, [mass.with_values(1.2 * mass.values)])
 
 
 def simulators(randomise: float) -> RPTO:

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import SMALL_POLICY, pendulum, small
+from conftest import SMALL_POLICY, heavier, pendulum, small
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import EvalCallback
@@ -21,18 +21,10 @@ from sb3_rpto import RPO, RPTO
 from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.factory import preset_section
 from sb3_rpto.dynamics.simulator import physical_config
-from sb3_rpto.effects import declare
-from sb3_rpto.envs.corrected import apply_effects
 
 POLE = "InvertedPendulum-v5"
 #: Falls beyond this many rad end an episode.
 FALLEN = 0.2
-
-
-def heavier(factor: float = 1.2) -> gym.Env:
-    env = gym.make(POLE)
-    (mass,) = declare(env.unwrapped.model, ["pole.mass"])  # type: ignore[attr-defined]
-    return apply_effects(env, [mass.with_values(factor * mass.values)])
 
 
 def simulated(source: Any, **kwargs: Any) -> RPTO:
