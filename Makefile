@@ -6,7 +6,9 @@ BIN := .venv/bin
 
 setup: .venv/.ready
 
-# Not compiled: of all that is installed a small part is ever imported, and is compiled then.
+# Not compiled: of all that is installed a small part is ever imported, and is compiled then. Where the environment
+# forbids to keep that, each process would compile it anew: seconds for every one that a test or a sweep starts.
+unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt
 
 .venv/.ready: setup.cfg pyproject.toml constraints.txt

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from conftest import SMALL_ENSEMBLE, SMALL_POLICY
@@ -123,6 +124,24 @@ def test_steps_end_between_samples_too() -> None:
     truth = np.stack([0.1 * np.sin(3 * at), 0.05 * np.cos(2 * at), 0.3 * np.cos(3 * at), -0.1 * np.sin(2 * at)], axis=1)
     np.testing.assert_allclose(found["observations"], truth, atol=1e-5)
     assert len(at) == int(time[-1] / DT)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "simulated", "lead"), [("EULER", False, 0.01), ("EULER", True, 0), ("RK4", False, 0)]
+)
+def test_commands_of_a_robot_act_from_half_a_step_before_their_instant(
+    integrator: str, simulated: bool, lead: float
+) -> None:
+    env = gym.make(TASK)
+    base: Any = env.unwrapped
+    base.model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+    assert base.model.opt.timestep == 0.02
+    time = 0.001 * np.arange(1000)
+    ramp = {"time": time, "qpos.slider": time, "qpos.hinge": 0 * time, "ctrl.slide": time}
+    ramp |= {"qvel.slider": 1 + 0 * time, "qvel.hinge": 0 * time} if simulated else {}
+    found = transitions(replace(Measurements.from_tables({"ramp": ramp}), simulated=simulated), env)
+    mean = 3 * found["actions"][:, 0] - found["observations"][:, 0]
+    np.testing.assert_allclose(mean, 0.5 * (DT - 0.001) - lead, atol=2e-4)
 
 
 def test_no_step_spans_what_was_not_measured() -> None:

@@ -226,6 +226,21 @@ def test_missed_touch_downs_do_not_drown_the_rest(data):
     assert dynamics.error(fresh) < 0.5 * relative_error(simulated, fresh)
 
 
+def test_a_missed_touch_down_counts_as_three_times_what_others_miss_at_most(data, monkeypatch):
+    jumps = th.zeros_like(data.observations)
+    jumps[::50] = 20.0
+    dynamics, taught = make(), []
+    monkeypatch.setattr(dynamics.ensemble, "fit", lambda examples, weights, max_steps: taught.append(examples))
+    dynamics.fit(replace(data, next_observations=data.next_observations + jumps))
+    (examples,) = taught
+    missed = (examples.next_observations - examples.observations).abs()
+    usual = missed[th.arange(len(missed)) % 50 != 0].quantile(0.95, dim=0)
+    learned = usual > 0.0
+    assert learned.any()
+    assert (missed[::50, learned] < 4.0 * usual[learned]).all()
+    assert (missed[::50, learned] > 2.0 * usual[learned]).all()
+
+
 def test_unknown_states_are_left_out():
     fast = collect("InvertedDoublePendulum-v5", 200, seed=0, missing=False, speed=6.0)
     dynamics = make("InvertedDoublePendulum-v5")

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
+from conftest import coarsely
 
 from sb3_rpto.effects import Drive, Scales, Simulation
 from sb3_rpto.effects.effect import Effect
@@ -27,7 +28,8 @@ WITH_WHEEL = PENDULUM.replace(
 
 def briefly(model: str, data: Measurements, declared: Sequence[str], candidates: Sequence[str]) -> Report:
     """A trace in windows of 0.35 s: what is tested does not hang on their length, and short ones take less time."""
-    return trace(model, data, declared, candidates=candidates, horizon=0.35, threads=1)
+    with coarsely():
+        return trace(model, data, declared, candidates=candidates, horizon=0.35, threads=1)
 
 
 def compiled(xml: str = PENDULUM) -> mujoco.MjModel:

@@ -35,9 +35,15 @@ def strict(text: str) -> dict:
 
 
 def test_the_planted_friction_is_found_with_its_level(report: Report, planted) -> None:
+    assert report.verdict == "explained"
     (found,) = report.effects
     assert found.label == "coulomb_friction(hinge)"
-    assert found.effect.values[0] == pytest.approx(planted.truth.effects["coulomb_friction"]["torque"], rel=0.1)
+    assert found.effect.values[0] == pytest.approx(planted.truth.effects["coulomb_friction"]["torque"], rel=0.05)
+    low, high = found.interval[:, 0]
+    assert low < found.effect.values[0] < high
+    assert found.t > report.threshold
+    assert not report.adequacy_before.adequate
+    assert report.adequacy_after.adequate
     at = [e.horizon for e in report.before].index(0.5)
     assert report.after[at].rmse[0] < 0.3 * report.before[at].rmse[0]
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from conftest import coarsely
 from gymnasium.envs.mujoco.inverted_double_pendulum_v5 import InvertedDoublePendulumEnv
 from simulated import PENDULUM, RATE, WITH_WHEEL, briefly, compiled, recorded
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -43,7 +43,7 @@ def planted(*effects: tuple[str, str], seed: int = 1) -> Planted:
 def traced(p: Planted, data: Measurements | None = None, kinds: Sequence[str] = NATIVE, seed: int = 0) -> Report:
     assert 'timestep="0.002"' in p.xml
     xml = p.xml.replace('timestep="0.002"', 'timestep="0.005"')  # as far apart as the samples
-    with mock.patch("sb3_rpto.tracing.windows.LONGEST", 0.005):
+    with coarsely():
         return trace(xml, data or p.measurements, p.declared, seed=seed, candidates=kinds, threads=1)
 
 
@@ -71,7 +71,7 @@ def traced_simply(
     progress: Callable[[float, str], None] | None = None,
 ) -> Report:
     data = data or simple()
-    with mock.patch("sb3_rpto.tracing.windows.LONGEST", 0.01):
+    with coarsely(0.01):
         return trace(model, data, declared, candidates=kinds, horizon=horizon, threads=1, progress=progress)
 
 
@@ -140,7 +140,7 @@ def test_one_test_run_of_several_that_differs_is_named_alone() -> None:
     assert found.where == data.episodes[-1].run
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_complete_model_is_complete_and_nothing_is_named(seed: int) -> None:
     p, report = planted(seed=seed), complete(seed)
     assert report.verdict == "complete"
@@ -157,6 +157,7 @@ def test_a_complete_model_is_complete_and_nothing_is_named(seed: int) -> None:
         assert 0.5 < before.rmse[0] / floor.rmse[0] < 1.6
 
 
+@pytest.mark.slow
 def test_dry_friction_is_explained_with_its_level() -> None:
     p = planted(("coulomb_friction", "large"), seed=6)
     report = traced(p)
@@ -501,7 +502,8 @@ def test_a_calibrated_threshold_is_the_one_that_selects(
     monkeypatch.setattr("sb3_rpto.tracing.search.calibrated", calibrated)
     data = recorded([CoulombFriction("hinge", level=0.08)], model=compiled(COARSE), rate=100)
     settings: dict[str, Any] = {"candidates": ["coulomb_friction"], "horizon": 0.35, "threads": 1}
-    report = trace(COARSE, data, ["hinge.damping"], calibrate=20, seed=3, **settings)
+    with coarsely(0.01):
+        report = trace(COARSE, data, ["hinge.damping"], calibrate=20, seed=3, **settings)
     assert asked == [(2, [1], 20, 3)]
     assert report.verdict == verdict
     if verdict == "explained":  # else a t of 2 is enough: far from the noise other limits hold
@@ -576,7 +578,7 @@ def late(level: float = 0.0) -> Measurements:
 
 
 def with_known(data: Measurements, *known: Effect, declared: Sequence[str] = ("pole.mass",)) -> Report:
-    with mock.patch("sb3_rpto.tracing.windows.LONGEST", 0.01):
+    with coarsely(0.01):
         return trace(COARSE, data, declared, known=known, candidates=NATIVE, horizon=0.4, threads=1)
 
 
