@@ -26,6 +26,10 @@ settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
 ALGORITHMS = [RPO, RTO, RPTO]
+#: for tests of what RPTO runs, too
+OURS = [RPO, pytest.param(RTO, marks=pytest.mark.slow), RPTO]
+#: source steps that the networks are first fitted to
+PHI_0_STEPS = 100
 SMALL_POLICY = {"net_arch": [16]}
 SMALL_ENSEMBLE = {"hidden": (16, 16), "n_members": 3, "n_elites": 2, "max_steps": 30}
 
@@ -33,9 +37,9 @@ SMALL_ENSEMBLE = {"hidden": (16, 16), "n_members": 3, "n_elites": 2, "max_steps"
 @pytest.fixture(autouse=True)
 def _short_source_phase(monkeypatch):
     """The collection for phi_0 takes 25,000 source steps; tests are served by fewer."""
-    monkeypatch.setattr(warm, "PHI_0_STEPS", 300)
+    monkeypatch.setattr(warm, "PHI_0_STEPS", PHI_0_STEPS)
     monkeypatch.setattr(warm, "PHI_0_UPDATES", 30)
-    monkeypatch.setattr(warm, "FIRST_SOURCE_STEPS", 300)
+    monkeypatch.setattr(warm, "FIRST_SOURCE_STEPS", PHI_0_STEPS)
 
 
 def pendulum(g: float = 10.0) -> gym.Env:

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import ALGORITHMS, SMALL_ENSEMBLE, SMALL_POLICY, small
+from conftest import OURS, SMALL_ENSEMBLE, SMALL_POLICY, small
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
@@ -57,7 +57,7 @@ class Watch(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("cls", OURS)
 @pytest.mark.parametrize(("sample_freq", "redrawn"), [(-1, 1), (4, 2)])
 def test_exploration_noise_lasts_in_episodic_training(cls, sample_freq, redrawn):
     model = small(cls, short(10.0), short(), train_freq=(1, "episode"), use_sde=True, sde_sample_freq=sample_freq)
@@ -75,7 +75,7 @@ def test_a_rollout_is_as_many_episodes_as_train_freq_says_within_the_budget():
     assert model.target_spent == {"learning": 37}
 
 
-@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("cls", OURS)
 def test_a_resumed_source_phase_still_notices_a_target_equal_to_the_source(cls, tmp_path):
     # unseeded: the loaded model's own reset begins elsewhere than the saved target stands
     model = small(cls, short(10.0), short(10.0), seed=None, learning_starts=0)

@@ -78,8 +78,8 @@ def reads(monkeypatch):
 @pytest.mark.filterwarnings("ignore:EnsembleDynamics learns terminations")
 def test_a_burst_reads_its_losses_at_the_end_and_nothing_else(cls, kwargs, losses, made, reads):
     model = made(cls, **kwargs)
-    model.train(50, BATCH)
-    assert reads == [50] * losses
+    model.train(20, BATCH)
+    assert reads == [20] * losses
 
 
 def test_reading_within_a_burst_would_be_noticed(made, reads, monkeypatch):

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import ALGORITHMS, SMALL_ENSEMBLE, SMALL_POLICY, pendulum, small
+from conftest import OURS, SMALL_ENSEMBLE, SMALL_POLICY, pendulum, small
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -119,6 +119,7 @@ CASES = {
 SLOW_CASES = (
     "rpo-pendulum",
     "rto-pendulum",
+    "rpto-physical",
     "rpo-mujoco",
     "rpto-residual",
     "rpto-gsde",
@@ -192,7 +193,7 @@ class NextNumbers(BaseCallback):
         self.drawn.append(th.rand(5, device="cuda"))
 
 
-@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("cls", OURS)
 def test_saving_a_loaded_model_again_keeps_where_it_stood(cls, tmp_path):
     def resumed(name):
         model = cls.load(tmp_path / name, env=pendulum(), target_env=pendulum(12.0), device="cpu")
@@ -220,7 +221,7 @@ def test_a_world_that_is_built_otherwise_begins_a_new_episode(tmp_path):
     assert model.num_timesteps == 40
 
 
-@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("cls", OURS)
 def test_a_checkpoint_alone_can_predict(cls, tmp_path):
     model = small(cls).learn(60, source_timesteps=0)
     model.save(tmp_path / "model.zip")

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import ALGORITHMS, SMALL_ENSEMBLE, pendulum, small
+from conftest import ALGORITHMS, OURS, PHI_0_STEPS, SMALL_ENSEMBLE, pendulum, small
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
@@ -29,7 +29,7 @@ class CountingPendulum(gym.Wrapper):
         return super().step(action)
 
 
-@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("cls", OURS)
 def test_exactly_the_budget_is_spent_in_the_target(cls):
     target = CountingPendulum(pendulum(12.0))
     model = small(cls, target=target)
@@ -83,7 +83,7 @@ def test_no_random_action_in_the_target():
     assert chronological(model.replay_buffer.target)["actions"].min() > 0.99
 
 
-@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("cls", OURS)
 def test_a_fresh_model_trains_in_the_source_first_and_once(cls):
     calls = []
 
@@ -114,7 +114,7 @@ def test_the_source_phase_is_plain_sac():
         np.testing.assert_allclose(model.snapshots["source"]["policy"][name], value, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("cls", OURS)
 def test_callbacks_can_stop(cls):
     model = small(cls)
     model.learn(1000, callback=StopTrainingOnMaxEpisodes(1), source_timesteps=0)
@@ -163,7 +163,7 @@ def test_logged_keys_are_those_of_the_docs():
     assert all(len(key) <= 33 and key == key.lower() for key in seen)
 
 
-@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("cls", OURS)
 def test_a_target_equal_to_the_source_is_noticed_without_a_step(cls):
     target = CountingPendulum(pendulum())
     env = gym.make("Pendulum-v1", g=10.0)
@@ -201,7 +201,9 @@ def test_vec_normalize_statistics_are_the_sources_alone():
     assert shared.obs_rms is source.obs_rms
     assert not shared.training
     counted = source.obs_rms.count
-    assert counted == pytest.approx(300 + 3 * 2, abs=12)  # what phi_0 is fitted to, the source phase's steps among it
+    assert counted == pytest.approx(
+        PHI_0_STEPS + 3 * 2, abs=12
+    )  # what phi_0 is fitted to, the source phase's steps among it
     speeds = chronological(model.replay_buffer.target)["observations"][:, :2]
     np.testing.assert_allclose((speeds**2).sum(1), 1.0, atol=1e-5)  # cos, sin: stored raw
     model.set_env(VecNormalize(make_vec_env(pendulum, n_envs=2, seed=1)))
@@ -222,7 +224,7 @@ def test_the_source_phase_is_ten_times_the_budget_and_has_an_end(budget, steps, 
     assert asked == [steps]
 
 
-@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("cls", OURS)
 def test_several_source_environments(cls):
     model = small(cls, make_vec_env(pendulum, n_envs=3, seed=0), pendulum(12.0))
     model.learn(30, source_timesteps=60)
@@ -494,7 +496,7 @@ def test_the_source_phase_keeps_more_than_the_transfer_does():
     assert model._pretrained_steps == 90
     model = small(RPTO, buffer_size=40)
     model.learn(3, source_timesteps=90)
-    assert len(model.replay_buffer.source_starts) == 300  # the phase's 90 and as many more as phi_0 wants
+    assert len(model.replay_buffer.source_starts) == PHI_0_STEPS  # the phase's 90 and as many more as phi_0 wants
 
 
 @pytest.mark.parametrize("cls", [RTO, RPTO])

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import ALGORITHMS
+from conftest import ALGORITHMS, OURS
 from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
@@ -36,7 +36,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 from stable_baselines3.sac.policies import SACPolicy
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_rpto import RPO, RPTO, RTO
+from sb3_rpto import RPO, RPTO
 from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
@@ -45,7 +45,6 @@ EPISODE = 10
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 #: RTO runs the code that RPTO runs, less RPO's term; what SB3's own does changes with its version alone.
-OURS = [RPO, pytest.param(RTO, marks=pytest.mark.slow), RPTO]
 every_class = pytest.mark.parametrize("cls", [pytest.param(SAC, marks=pytest.mark.slow), *OURS])
 ours = pytest.mark.parametrize("cls", OURS)
 pytestmark = pytest.mark.filterwarnings("ignore:EnsembleDynamics learns terminations")

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import ALGORITHMS, pendulum
+from conftest import OURS, pendulum
 from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common import logger as sb3_logger
@@ -63,7 +63,7 @@ SAC_DEFAULTS = {
 }
 SAC_ARGUMENTS = ["policy", "env", *SAC_DEFAULTS]
 
-ours = pytest.mark.parametrize("cls", ALGORITHMS)
+ours = pytest.mark.parametrize("cls", OURS)
 
 
 @pytest.fixture(autouse=True)

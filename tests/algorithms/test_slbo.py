@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
-from conftest import pendulum, small
+from conftest import PHI_0_STEPS, pendulum, small
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import configure
 
@@ -41,7 +41,7 @@ def test_a_stage_takes_its_model_steps_and_policy_updates(monkeypatch):
     assert rest == [7] * 2 * 2  # two stages, at 30 and 60 target steps
     assert learned == [40] * 2 * 2 * 3
     assert model._n_updates == 12
-    assert model.source_timesteps == 300 + 12 * 40
+    assert model.source_timesteps == PHI_0_STEPS + 12 * 40
     assert phi_0 == 30
 
 

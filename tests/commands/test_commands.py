@@ -432,13 +432,19 @@ def test_what_a_killed_checkpoint_left_is_not_in_the_way(tmp_path: Path) -> None
 
 def test_two_processes_do_not_share_a_folder(tmp_path: Path) -> None:
     config = {"command": "train", "a": 1}
+    lock = f"from filelock import FileLock; lock = FileLock({str(tmp_path / '.lock')!r}); lock.acquire(blocking=False)"
+    other = [sys.executable, "-c", f"{lock}; print('there'); input()"]  # what opening a folder does, imported quickly
+    with subprocess.Popen(other, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "there\n"
+        with pytest.raises(ValueError, match="another process runs there; wait until it ends, or give another folder"):
+            RunFolder.open(tmp_path, config)
+        process.communicate("go\n")
     run = RunFolder.open(tmp_path, config)
-    imports = "from pathlib import Path; from sb3_rpto.commands.runs import RunFolder"
-    other = f"{imports}; RunFolder.open(Path({str(tmp_path)!r}), {config})"
-    told = subprocess.run([sys.executable, "-c", other], capture_output=True, text=True, check=False)
-    assert "another process runs there; wait until it ends, or give another folder" in told.stderr
+    told = subprocess.run(other, input="go\n", capture_output=True, text=True, check=False)
+    assert "Timeout" in told.stderr
     del run
-    subprocess.run([sys.executable, "-c", other], check=True)
+    subprocess.run(other, input="go\n", text=True, check=True)
 
 
 def test_a_run_is_the_same_from_everywhere(agent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import SMALL_ENSEMBLE, SMALL_POLICY
+from conftest import PHI_0_STEPS, SMALL_ENSEMBLE, SMALL_POLICY
 from stable_baselines3 import SAC
 from stable_baselines3.common import base_class
 from stable_baselines3.common.env_util import make_vec_env
@@ -142,15 +142,15 @@ def test_updates_and_source_steps_are_counted(source_model: str) -> None:
     assert last["sac-warm-high"]["updates"] == (BUDGET - 1) * rptos > BUDGET
     assert last["trpo-warm"]["updates"] == 4  # rollouts of 15, the last one's update included
     assert last["slbo"]["updates"] == 4 * 2 * 2
-    assert last["slbo"]["source_steps"] == 300 + 4 * 2 * 2 * 40
+    assert last["slbo"]["source_steps"] == PHI_0_STEPS + 4 * 2 * 2 * 40
     assert last["sac-warm"]["source_steps"] == 0
-    assert last["trpo-warm"]["source_steps"] == 300
+    assert last["trpo-warm"]["source_steps"] == PHI_0_STEPS
 
 
 @pytest.fixture
 def source_data(source_model: str, tmp_path_factory: pytest.TempPathFactory) -> str:
     data, spent = baselines.source_transitions(source_model, cartpole(), 0)
-    assert spent == len(data["rewards"]) == 300
+    assert spent == len(data["rewards"]) == PHI_0_STEPS
     names = {"obs": "observations", "act": "actions", "next_obs": "next_observations", "rew": "rewards"}
     path = tmp_path_factory.mktemp("data") / "d.npz"
     np.savez(path, done=data["terminations"], **{short: data[name] for short, name in names.items()})
@@ -200,7 +200,9 @@ def test_what_fits_no_networks_to_recorded_steps_keeps_none(
 
 def test_mixed_sac_draws_half_of_each_world(source_model: str) -> None:
     data, _ = baselines.source_transitions(source_model, cartpole(), 0)
-    model = baselines.mixed_sac(source_model, cartpole(pole_length=2.0), 0, {**data, "rewards": np.full(300, -7.0)})
+    model = baselines.mixed_sac(
+        source_model, cartpole(pole_length=2.0), 0, {**data, "rewards": np.full(PHI_0_STEPS, -7.0)}
+    )
     model.learn(40)
     for batch_size, of_source in ((64, 32), (33, 16)):
         batch = model.replay_buffer.sample(batch_size)
