@@ -59,7 +59,9 @@ def corrected(found: dict, model) -> Simulation:
     return Simulation(model, [*(d.with_values([v]) for d, v in zip(declared, values)), *effects], 1)
 
 
-@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "servo_xl330" else ()) for name in MACHINES]
+)
 def test_committed_errors_are_those_of_the_committed_values(name: str) -> None:
     machine, (found, rows) = MACHINES[name](FOLDER), committed(name)
     model = discretised(load_model(machine.xml)[1], machine.data, fine=True)
