@@ -176,5 +176,10 @@ def test_it_is_an_environments_model():
     env = gym.make("Pendulum-v1")
     model = DeterministicDynamics(env.observation_space, env.action_space, hidden=(8,), termination_fn=never)
     env = DynamicsEnv(env, model)
-    env.reset(seed=0)
-    assert np.isfinite(env.step(env.action_space.sample())[0]).all()
+    observation, _ = env.reset(seed=0)
+    for action in np.float32([[1.5], [-0.7]]):
+        answer = model.step(th.as_tensor(observation)[None], th.as_tensor(action)[None])
+        observation, reward, terminated, _, _ = env.step(action)
+        np.testing.assert_allclose(observation, answer.next_observations[0].numpy(), rtol=1e-6)
+        assert reward == pytest.approx(float(answer.rewards[0]))
+        assert not terminated

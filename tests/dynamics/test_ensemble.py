@@ -345,6 +345,13 @@ def test_patience_ends_a_fit():
     assert log["steps"] == log["epochs"] * 20  # one batch an epoch would be judged too often
 
 
+def test_a_hundredth_less_is_an_improvement_and_less_than_that_is_none(monkeypatch):
+    model, errors = make(patience=2), iter([1.0, 0.995, 0.989, 0.985, 0.981, 0.5])
+    monkeypatch.setattr(model, "_judge", lambda held: 2 * (th.full((model.n_members,), next(errors)),))
+    monkeypatch.setattr(model, "_train_epoch", lambda train, most: (th.tensor(0.0), 1))
+    assert model.fit(linear(300), max_steps=100)["epochs"] == 4
+
+
 def test_every_member_has_its_own_order_and_sees_all():
     model = make(batch_size=100)
     train, _ = model._prepare(linear(500), None)

@@ -545,6 +545,11 @@ def test_command(traced, tmp_path, capsys):
     arguments = ["--out", str(tmp_path), "--scale", "quick", "--workers", "1", "--only", "^complete-pendulum-1mrad$"]
     assert tracing_benchmark.main(arguments) == 0
     assert "1 of 1 generated sets traced" in capsys.readouterr().out
+    assert tracing_benchmark.main(arguments) == 0
+    assert len(traced) == 1
+    assert tracing_benchmark.main([*arguments, "--fresh"]) == 0
+    assert len(traced) == 2
+    capsys.readouterr()
     assert json.loads((tmp_path / "manifest.json").read_text())["command"].startswith("sb3-rpto benchmark tracing")
     assert tracing_benchmark.main([*arguments[2:], "--list"]) == 0
     assert capsys.readouterr().out == "complete-pendulum-1mrad\n"

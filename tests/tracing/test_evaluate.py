@@ -10,7 +10,7 @@ from simulated import RATE, compiled, recorded, torques
 from sb3_rpto.effects import Simulation
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
-from sb3_rpto.tracing.evaluate import HORIZONS, horizon_errors, noise_floor, predictions, whole_runs
+from sb3_rpto.tracing.evaluate import HORIZONS, OVERLAP, _pool, horizon_errors, noise_floor, predictions, whole_runs
 from sb3_rpto.tracing.windows import cut
 
 SIGMA = np.array([1e-3])
@@ -114,6 +114,17 @@ def test_intervals_hold_the_error_and_resample_blocks() -> None:
     for e in horizon_errors(simulation, simulation.null, data, SIGMA, 0):
         assert 0 < e.low[0] <= e.rmse[0] <= e.high[0]
         assert 0 < e.mae[0] <= e.rmse[0]
+
+
+def test_blocks_are_resampled_and_not_the_windows_within_them() -> None:
+    """Of two blocks a quarter of all draws holds one alone, so that the bounds are what each errs by."""
+    windows = cut(compiled(), recorded(episodes=2, duration=4.0), SIGMA, 0.1, 200, OVERLAP)
+    first = np.arange(len(windows)) < len(windows) // 2
+    windows = replace(windows, block=np.where(first, 0, 1))
+    difference = np.where(first, 0.1, 0.3)[:, None, None] * np.ones((*windows.usable.shape, 1))
+    found = _pool(difference, windows.usable, windows, ("hinge",), 0.1, 0)
+    assert found.low[0] == pytest.approx(0.1)
+    assert found.high[0] == pytest.approx(0.3)
 
 
 def test_horizons_that_no_run_is_long_enough_for_are_left_out() -> None:
