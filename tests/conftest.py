@@ -26,7 +26,7 @@ settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
 ALGORITHMS = [RPO, RTO, RPTO]
-#: for tests of what RPTO runs, too
+#: RTO runs the code that RPTO runs, less RPO's term.
 OURS = [RPO, pytest.param(RTO, marks=pytest.mark.slow), RPTO]
 #: source steps that the networks are first fitted to
 PHI_0_STEPS = 100

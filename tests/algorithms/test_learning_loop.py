@@ -201,9 +201,8 @@ def test_vec_normalize_statistics_are_the_sources_alone():
     assert shared.obs_rms is source.obs_rms
     assert not shared.training
     counted = source.obs_rms.count
-    assert counted == pytest.approx(
-        PHI_0_STEPS + 3 * 2, abs=12
-    )  # what phi_0 is fitted to, the source phase's steps among it
+    # what phi_0 is fitted to, the source phase's steps among it
+    assert counted == pytest.approx(PHI_0_STEPS + 3 * 2, abs=12)
     speeds = chronological(model.replay_buffer.target)["observations"][:, :2]
     np.testing.assert_allclose((speeds**2).sum(1), 1.0, atol=1e-5)  # cos, sin: stored raw
     model.set_env(VecNormalize(make_vec_env(pendulum, n_envs=2, seed=1)))

@@ -44,7 +44,7 @@ from sb3_rpto.algorithms.transfer import TransferAlgorithm
 EPISODE = 10
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
-#: RTO runs the code that RPTO runs, less RPO's term; what SB3's own does changes with its version alone.
+#: What SB3's own does changes with its version alone.
 every_class = pytest.mark.parametrize("cls", [pytest.param(SAC, marks=pytest.mark.slow), *OURS])
 ours = pytest.mark.parametrize("cls", OURS)
 pytestmark = pytest.mark.filterwarnings("ignore:EnsembleDynamics learns terminations")

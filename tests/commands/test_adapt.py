@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch as th
-from conftest import coarsely
 from stable_baselines3 import SAC
 
 from sb3_rpto import RPTO, cli
@@ -50,8 +49,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def adapt(given: Path, out: Path, *options: str, agent: str = "agent.zip", env: str = ENV, log: str = "log.csv") -> int:
     found = ["--candidates", "torque_offset", *FEW, *options]
-    with coarsely():
-        return cli.main(["adapt", str(given / agent), env, str(given / log), "--out", str(out), *found])
+    return cli.main(["adapt", str(given / agent), env, str(given / log), "--out", str(out), *found])
 
 
 @pytest.mark.slow
