@@ -77,7 +77,7 @@ def jobs(seeds: list[int], budget: int, lengths: list[float], shifts: dict[str, 
 
 def source_policy(folder: Path, seed: int) -> str:
     """Train in the source until the pole stands twice in a row; keep the best policy by evaluations in the source."""
-    path = folder / f"source_{seed}.zip"
+    path, best_so_far = folder / f"source_{seed}.zip", folder / f"source_{seed}.part.zip"
     if path.exists():
         return str(path)
     _prepare_worker()
@@ -90,9 +90,10 @@ def source_policy(folder: Path, seed: int) -> str:
         standing = standing + 1 if reached >= STANDING else 0
         if reached >= best:
             best = reached
-            model.save(path)
+            model.save(best_so_far)
         if standing == 2:
             break
+    best_so_far.replace(path)  # not before, lest a killed study goes on with a policy that cannot balance
     return str(path)
 
 

@@ -145,3 +145,23 @@ def test_close_the_loop_names_what_is_in_the_target(monkeypatch, tmp_path, capsy
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py")))
 def test_examples_say_how_they_are_run(name):
     assert f"python examples/{name}" in (EXAMPLES / name).read_text()
+
+
+def test_a_killed_training_of_a_source_policy_leaves_none(monkeypatch, tmp_path):
+    panels = load("cartpole_panels", monkeypatch)
+    monkeypatch.setitem(panels.SAC_SETTINGS, "learning_starts", 10**6)
+    seen = iter([20.0, 30.0, KeyboardInterrupt, *[10.0] * 20, 600.0, 600.0])
+
+    def evaluated(*_):
+        found = next(seen)
+        if found is KeyboardInterrupt:
+            raise found
+        return found
+
+    monkeypatch.setattr(panels, "evaluate", evaluated)
+    monkeypatch.setattr(panels.SAC, "learn", lambda self, *_, **__: self)
+    with pytest.raises(KeyboardInterrupt):
+        panels.source_policy(tmp_path, 0)
+    assert Path(panels.source_policy(tmp_path, 0)).name == "source_0.zip"
+    assert next(seen, "none") == "none", "it was trained anew, to the end"
+    assert panels.source_policy(tmp_path, 0) == str(tmp_path / "source_0.zip")

@@ -403,6 +403,7 @@ def test_a_search_is_judged_on_the_target(zoo, agent, tmp_path, monkeypatch):
         (["--env", TARGET, "--source-model", "absent.zip"], "there is no file 'absent.zip'"),
         (["--env", TARGET, "--source-data", "absent.npz"], "there is no file 'absent.npz'"),
         (["--env", TARGET, "-optimize"], "-optimize needs --source-model"),
+        (["--env", TARGET, "--algo", "rto", "--source-model", __file__, "-optimize"], "leaves the policy as it is"),
         (["--env", TARGET, "--source-model", __file__, "-i", "some.zip"], "leave one of them out"),
         (["--env", TARGET, "--algo", "sac", "--source-model", __file__], "--algo sac has one world"),
     ],

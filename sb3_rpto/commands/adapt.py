@@ -54,6 +54,7 @@ def run(parsed: argparse.Namespace) -> int:
     """Trace and learn, or go on with it."""
     from sb3_rpto import RPTO
     from sb3_rpto.algorithms.arguments import constructor_names
+    from sb3_rpto.commands.policies import check_raw
     from sb3_rpto.commands.progress import Progress, earnings, read_rows
     from sb3_rpto.commands.runs import RunFolder, beside, load_checkpoint
     from sb3_rpto.commands.terminal import lines, say
@@ -66,6 +67,7 @@ def run(parsed: argparse.Namespace) -> int:
     options.check_positive(parsed, "steps")
     options.check_seed(parsed.seed)
     options.check_file(parsed.source_model, "ZIP")
+    check_raw(parsed.source_model, "RPTO(..., target_data=log) in Python, with the source in its VecNormalize")
     recordings.check_candidates(parsed.candidates)
     settings = dict(parsed.set)
     options.check_names(settings, constructor_names(RPTO) - GIVEN)

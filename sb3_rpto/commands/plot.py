@@ -131,6 +131,9 @@ def _result(file: Path) -> list[dict[str, Any]] | None:
 
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
+        if content.get("config", {}).get("command") == "adapt":
+            print(f"sb3-rpto: left out, learned from a log, so that there is no curve: {file}", file=sys.stderr)
+            return None
         if "job" in content:  # of the benchmark: a method with its settings has a label
             shifted = env_id(content["job"]["task"], content["target"]["shift"])  # as of ``transfer``
             of_run = {"method": content["job"]["label"], "target": shifted, "seed": content["job"]["seed"]}

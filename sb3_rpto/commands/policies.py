@@ -55,6 +55,20 @@ def load_policy(path: str | Path, argument: str) -> Policy:
     return policy
 
 
+def check_raw(path: str | Path, instead: str) -> None:
+    """Refuse an agent that saw normalised observations, as far as the files beside its zip tell.
+
+    :param path: of the zip
+    :param instead: what to use for such an agent
+    :raises ValueError: naming the statistics
+    """
+    statistics = statistics_of(path)
+    if statistics is not None:
+        raise ValueError(
+            f"ZIP {str(path)!r} saw observations normalised by {statistics}, which this command cannot: use {instead}"
+        )
+
+
 def statistics_of(path: str | Path) -> Path | None:
     """The statistics of VecNormalize that the zoo or SB3's callbacks left with a zip; None where there are none.
 

@@ -37,8 +37,8 @@ BESIDE_SAC = {
     "sac-warm-high": {"n_critics"},
     "sysid-retrain": {"declared", "retrain_steps", "max_steps", "dynamics_kwargs"},
 }
-#: SAC in the target.
-OF_SAC = ("sac", "sac-warm", "sac-warm-high", "sac-mixed", "oracle")
+#: SAC in the target, or in what was identified of it.
+OF_SAC = ("sac", "sac-warm", "sac-warm-high", "sac-mixed", "sysid-retrain", "oracle")
 #: Methods that begin anew: nothing is learned step by step, or in two parts.
 NOT_RESUMABLE = ("zero-shot", "sysid-retrain")
 
@@ -194,15 +194,10 @@ def _check_worlds(parsed: argparse.Namespace, source: options.World, target: opt
     """
     from sb3_rpto.algorithms.warm import load_sac
     from sb3_rpto.buffers import load_transitions
-    from sb3_rpto.commands.policies import statistics_of
+    from sb3_rpto.commands.policies import check_raw
     from sb3_rpto.experiments.methods import REGISTRY
 
-    statistics = statistics_of(parsed.source_model)
-    if statistics is not None:
-        raise ValueError(
-            f"ZIP {parsed.source_model!r} saw observations normalised by {statistics}, which this command cannot: use "
-            "python -m sb3_rpto.zoo.train, or VecNormalize in Python"
-        )
+    check_raw(parsed.source_model, "python -m sb3_rpto.zoo.train, or VecNormalize in Python")
     sac = load_sac(parsed.source_model, "cpu")
     for argument, world in (("TARGET", target), ("--source", source)):
         env = world.make()

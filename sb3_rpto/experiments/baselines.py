@@ -22,6 +22,7 @@ from sb3_rpto.algorithms.source import EpisodeSource, make_source_world
 from sb3_rpto.algorithms.update import as_transitions
 from sb3_rpto.algorithms.worlds import check_spaces
 from sb3_rpto.buffers import DualReplayBuffer, World, chronological, load_transitions
+from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics
 
 #: Gradient steps of each critic that is added to a source model's two.
@@ -34,7 +35,8 @@ def fine_tuned_sac(
 ) -> SAC:
     """SAC-warm: the source's SAC, ready to go on in the target from its first step, with an empty replay buffer.
 
-    It collects step by step, so that a budget is met exactly, with as many updates per step as in the source.
+    It collects step by step, so that a budget is met exactly, with as many updates per step as in the source
+    (a step of several environments side by side counts once), and not less than one.
 
     :param source_model: zip of the SAC that was trained in the source
     :param target: the target
@@ -245,6 +247,19 @@ def cloned_trpo(
 # ---------------------------------------------------------------------- identify, then retrain
 
 
+def unfitted_source(source: VecEnv, declared: Sequence[str], dynamics_kwargs: dict[str, Any] | None = None) -> Dynamics:
+    """The source simulator before its declared numbers are fitted; parameters as of :func:`identified_source`.
+
+    :raises ValueError: a source that is no simulator, names that it does not have, wrong arguments
+    """
+    # The fit is no curriculum here: it may go all the way at once.
+    config = dynamics_config("physical", source, {"max_step": 0.1, **(dynamics_kwargs or {})}, declared)
+    observation_space, action_space = source.observation_space, source.action_space
+    assert isinstance(observation_space, spaces.Box)  # dynamics_config would have refused the source
+    assert isinstance(action_space, spaces.Box)
+    return make_dynamics(config, observation_space, action_space)
+
+
 def identified_source(
     recorded: ReplayBuffer,
     recorder: SAC,
@@ -265,12 +280,7 @@ def identified_source(
     :param dynamics_kwargs: further arguments of the physical model
     :return: environments to train in, and what was found
     """
-    # The fit is no curriculum here: it may go all the way at once.
-    config = dynamics_config("physical", source, {"max_step": 0.1, **(dynamics_kwargs or {})}, declared)
-    observation_space, action_space = recorder.observation_space, recorder.action_space
-    assert isinstance(observation_space, spaces.Box)  # dynamics_config would have refused the source
-    assert isinstance(action_space, spaces.Box)
-    dynamics = make_dynamics(config, observation_space, action_space)
+    dynamics = unfitted_source(source, declared, dynamics_kwargs)
     dynamics.seed(seed)
     dynamics.fit(as_transitions(chronological(recorded), recorder.policy, recorder.device), max_steps=max_steps)
     world = make_source_world(source, dynamics, "source", 1)

@@ -210,9 +210,22 @@ def noisy(env: gym.Env, noise: np.ndarray, seed: int) -> gym.Env:
 
 @cache
 def source_agent(task: str, folder: Path) -> tuple[str, str | None]:
-    """The source's SAC and its transitions; see :func:`sb3_rpto.experiments.sources.source_agent`."""
+    """The source's SAC and its transitions, see :func:`sb3_rpto.experiments.sources.source_agent`; one for a folder.
+
+    :raises ValueError: the folder's runs are of another agent, with whose curves these would be pooled
+    """
     made = TASKS[task]
-    return sources.source_agent(made.env_id, partial(make_source, task), made.source_steps, folder)
+    agent, data = sources.source_agent(made.env_id, partial(make_source, task), made.source_steps, folder)
+    kept, found = folder / f"agent_{task}.json", {"sha256": sources.digest(agent)}
+    if not kept.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(kept, found)
+    elif json.loads(kept.read_text(encoding="utf-8")) != found:
+        raise ValueError(
+            f"the runs in {folder} are of another source agent than {agent}; give another folder, or by "
+            f"{sources.FOLDER_VARIABLE} the agent that they had"
+        )
+    return agent, data
 
 
 def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISODES) -> Path:

@@ -133,10 +133,16 @@ def _sysid_retrain(run: Run, curve: LearningCurve) -> None:
     identification = {name: settings.pop(name) for name in ("max_steps", "dynamics_kwargs") if name in settings}
     if not declared:
         raise ValueError("sysid-retrain needs declared=[...], the names of the simulator's numbers to identify")
+    for name, steps in (("retrain_steps", retrain_steps), ("max_steps", identification.get("max_steps", 1))):
+        if not isinstance(steps, int) or steps < 1:
+            raise ValueError(f"{name} must be an integer of at least 1, got {steps!r}")
+    # The target's steps are spent before these are used: what is wrong with them shows now.
+    source = make_vec_env(run.make_source, n_envs=1)
+    baselines.unfitted_source(source, declared, identification.get("dynamics_kwargs"))
+    baselines.fine_tuned_sac(run.source_model, source, run.seed, run.device, **settings)
     recorder = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, gradient_steps=0)
     recorder.learn(run.budget, callback=curve)
     assert recorder.replay_buffer is not None  # learn() has filled it
-    source = make_vec_env(run.make_source, n_envs=1)
     simulator, _ = baselines.identified_source(
         recorder.replay_buffer, recorder, source, declared, run.seed, **identification
     )

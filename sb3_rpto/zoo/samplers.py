@@ -28,7 +28,7 @@ def suggest(cls: type[TransferAlgorithm], trial: optuna.Trial) -> dict[str, Any]
     :return: by the names of the study's parameters, see :func:`convert`
     """
     params: dict[str, Any] = {}
-    if cls.updates_policy and cls is not SLBO:  # whose policy is TRPO's
+    if cls is not SLBO:  # whose policy is TRPO's
         params["learning_rate"] = trial.suggest_float("learning_rate", 3e-5, 1e-3, log=True)
         params["gradient_steps"] = trial.suggest_int("gradient_steps", 1, 40, log=True)
         params["real_ratio"] = trial.suggest_categorical("real_ratio", [0.0, 0.05, 0.2, 0.5])
@@ -44,8 +44,7 @@ def suggest(cls: type[TransferAlgorithm], trial: optuna.Trial) -> dict[str, Any]
     if not issubclass(cls, MBPO):
         params["weighting"] = trial.suggest_categorical("weighting", ["paper", "centred", "value_aware", "none"])
         params["weight_floor"] = trial.suggest_categorical("weight_floor", [0.1, 0.5, 1.0, 2.0])
-        if cls.updates_policy:
-            params["rollout_start"] = trial.suggest_categorical("rollout_start", ["target", "source", "mix"])
+        params["rollout_start"] = trial.suggest_categorical("rollout_start", ["target", "source", "mix"])
     if issubclass(cls, PTP):
         params["n_candidates"] = trial.suggest_int("n_candidates", 2, 6)
         params["horizon"] = trial.suggest_int("horizon", 1, 8)
@@ -71,5 +70,7 @@ def _sample(
     return convert(suggest(cls, trial))
 
 
-#: In the form of ``rl_zoo3.hyperparams_opt.HYPERPARAMS_SAMPLER``.
-SAMPLERS: dict[str, Callable[..., dict[str, Any]]] = {name: partial(_sample, cls) for name, cls in ALGORITHMS.items()}
+#: In the form of ``rl_zoo3.hyperparams_opt.HYPERPARAMS_SAMPLER``; of those that have a policy to judge.
+SAMPLERS: dict[str, Callable[..., dict[str, Any]]] = {
+    name: partial(_sample, cls) for name, cls in ALGORITHMS.items() if cls.updates_policy
+}

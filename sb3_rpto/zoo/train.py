@@ -129,6 +129,10 @@ def _start(parser: argparse.ArgumentParser, ours: argparse.Namespace, rest: list
             f"--env {theirs.env} is the source; name a target such as {source.removesuffix('-v0')}-target0-v0, or pass "
             "the target's arguments by --eval-env-kwargs"
         )
+    if theirs.optimize_hyperparameters and not ALGORITHMS[theirs.algo].updates_policy:
+        parser.error(
+            f"-optimize judges policies, and --algo {theirs.algo} leaves the policy as it is; search with rpto"
+        )
     if theirs.optimize_hyperparameters and ours.source_model is None:
         parser.error("-optimize needs --source-model: without it, every trial would first train an agent in the source")
     if ours.source_model is not None and theirs.trained_agent:

@@ -355,6 +355,8 @@ BAD = {
     "transfer A/model.zip T --out O --set weighting=papre": "weighting='papre'",
     "transfer A/model.zip T --out O --method sac-warm --set gama=1": "did you mean 'gamma'",
     "transfer A/model.zip T --out O --method sysid-retrain": "--set 'declared=[...]'",
+    "transfer A/model.zip T --out O --method sysid-retrain --set declared=[pole_length] --set gama=1": "mean 'gamma'",
+    "transfer A/model.zip T --out O --method sysid-retrain --set declared=[pole_length] --set gamma=2": "[0, 1], got 2",
     "transfer A/model.zip T --out O --method sac --set train_freq=4": "is met step by step",
     "transfer A/model.zip T --out O --method sac --steps 90": "ends before the first update (learning_starts=100)",
     "transfer A/model.zip T --out O --method sac-warm --set learning_starts=9": "sac-warm takes no random steps",
@@ -569,6 +571,8 @@ def test_normalised_observations_are_told(
     given = ["transfer", str(tmp_path / "Some-v0.zip"), TARGET, "--method", "rpo", "--out", str(tmp_path / "out")]
     assert cli.main(given) == 2
     assert f"normalised by {folder / 'vecnormalize.pkl'}" in error(capsys)
+    assert cli.main(["adapt", str(tmp_path / "Some-v0.zip"), SOURCE, "log.csv", "--out", str(tmp_path / "out")]) == 2
+    assert f"normalised by {folder / 'vecnormalize.pkl'}" in error(capsys)
     assert cli.main(["enjoy", str(tmp_path / "Some-v0.zip"), TARGET, "--episodes", "1"]) == 0
     assert f"normalised by {folder / 'vecnormalize.pkl'}" in capsys.readouterr().err
 
@@ -598,6 +602,10 @@ def test_plot_counts_seeds_and_tells_settings_apart(tmp_path: Path, capsys: pyte
         *(("rpto gradient_steps=20", 0), ("rpto gradient_steps=default", 0), ("rpto gradient_steps=default", 1))
     ]
     assert capsys.readouterr().err == f"sb3-rpto: left out, not finished: {tmp_path / 'unfinished'}\n"
+    (tmp_path / "adapted").mkdir()
+    (tmp_path / "adapted" / "result.json").write_text(json.dumps({"config": {"command": "adapt"}, "rows": []}))
+    read_rows([files[0], tmp_path / "adapted"])
+    assert "left out, learned from a log, so that there is no curve" in capsys.readouterr().err
     assert [row["method"] for row in read_rows(files[:2])] == ["rpto", "rpto"]
     for steps in (60, 80):  # a buffer as long as the run is the command's own
         config = {"method": "sac", "target": TARGET, "seed": steps, "steps": steps, "settings": {"buffer_size": steps}}

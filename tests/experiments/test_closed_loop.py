@@ -115,6 +115,20 @@ def test_an_oracle_of_other_steps_is_not_taken(tmp_path: Path, monkeypatch: pyte
     assert json.loads(kept.read_text()) == {"return": 9.0, "steps": 20}
 
 
+def test_a_folder_has_runs_of_one_source_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sources = tmp_path / "sources"
+    sources.mkdir()
+    agent = sources / "Hopper-v5.zip"
+    agent.write_text("an agent")
+    monkeypatch.setenv(study.sources.FOLDER_VARIABLE, str(sources))
+    found = study.source_agent.__wrapped__
+    assert found("hopper", tmp_path / "runs") == found("hopper", tmp_path / "runs") == (str(agent), None)
+    agent.write_text("another")
+    with pytest.raises(ValueError, match="another source agent"):
+        found("hopper", tmp_path / "runs")
+    assert found("hopper", tmp_path / "others")[0] == str(agent)
+
+
 def test_steps_to_a_share_of_the_oracle() -> None:
     line = study.steps_to_oracle(rows(), {("hopper", "none", 0): 760.0}).iloc[0]
     # 684 is reached at once by the third seed alone.

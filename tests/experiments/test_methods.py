@@ -307,9 +307,22 @@ def test_identify_then_retrain_finds_the_pole_and_trains_in_the_simulator_alone(
     np.testing.assert_allclose(simulator.step(action)[0][0], twin.step(action[0])[0], atol=1e-3)
 
 
-def test_identification_needs_names(source_model: str) -> None:
-    with pytest.raises(ValueError, match="declared"):
-        run("sysid-retrain", source_model, declared=())
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"declared": ()}, "declared"),
+        ({"declared": ["pole_lenght"]}, "did you mean 'pole_length'"),
+        ({"dynamics_kwargs": {"max_stepp": 1.0}}, "max_stepp"),
+        ({"max_steps": 0}, "max_steps must be an integer of at least 1, got 0"),
+        ({"retrain_steps": "ten"}, "retrain_steps must be an integer of at least 1, got 'ten'"),
+        ({"train_freq": 4}, "step by step"),
+    ],
+)
+def test_what_cannot_be_identified_costs_no_target_step(source_model: str, wrong: dict, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        run("sysid-retrain", source_model, **wrong)
+    trained = Counted.made[EPISODES:]  # the others evaluate
+    assert sum(env.steps for env in trained) == 0
 
 
 def test_the_row_of_a_method_that_learns_in_batches_is_of_what_it_has_learned(source_model: str) -> None:
