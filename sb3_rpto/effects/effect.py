@@ -135,12 +135,17 @@ class Effect:
         made.idle = self.idle
         return made
 
+    @property
+    def does_nothing(self) -> bool:
+        """Whether all parameters but those of shape are at their nulls."""
+        return all(value == p.null for p, value in zip(self.parameters, self.values) if not p.shape)
+
     def as_known(self) -> Effect:
         """The same effect, :attr:`known` to be there: its nulls are its values, where fits begin.
 
         :raises ValueError: with these values it does nothing
         """
-        if all(value == p.null for p, value in zip(self.parameters, self.values) if not p.shape):
+        if self.does_nothing:
             raise ValueError(f"known: {self!r} does nothing; give the values that are known, or leave it to the search")
         made = self.with_values(self.values)
         made.known = True

@@ -103,7 +103,7 @@ def _begin(one: gym.Env, other: gym.Env, seed: int | None) -> bool:
     if _equal(one.reset(seed=seed)[0], other.reset(seed=seed)[0]):
         return False
     mine, theirs = one.unwrapped, other.unwrapped
-    if hasattr(mine, "data") and hasattr(theirs, "data"):
+    if hasattr(mine, "data") and hasattr(theirs, "data") and mine.data.qpos.shape == theirs.data.qpos.shape:
         theirs.set_state(mine.data.qpos, mine.data.qvel)  # type: ignore[attr-defined]
     return True
 
@@ -135,7 +135,9 @@ def _numbers(one: Any, other: Any) -> dict[str, tuple[str, ...]]:
 
     mine, theirs = numbers(one.model), numbers(other.model)
     return {
-        name: _objects(one.model, name, np.asarray(mine[name] != theirs[name]))
+        name: _objects(one.model, name, mine[name] != theirs[name])
+        if np.shape(mine[name]) == np.shape(theirs[name])
+        else ()
         for name in differing(one.model, other.model)
     }
 

@@ -24,13 +24,14 @@ def shift_effects(shift: EnvShift, env: gym.Env) -> list[Effect]:
     :raises ValueError: names that the model does not have, numbers that are 0
     """
     model = env.unwrapped.model  # type: ignore[attr-defined]
-    scaled: dict[str, Declared] = {}
+    scaled: dict[tuple[str, int, str], Declared] = {}  # one number may be called by several names
     for name, factor in shift.factors.items():
         for label in number_names(env, [name]):
-            number = scaled.get(label) or Declared(model, label, (-np.inf, np.inf))
+            number = Declared(model, label, (-np.inf, np.inf))
+            number = scaled.get(number.number, number)
             if number.nominal == 0:
                 raise ValueError(f"{shift.name}: {label} is 0 in the model, so it cannot be scaled; give an effect")
-            scaled[label] = number.with_values(number.values * factor)
+            scaled[number.number] = number.with_values(number.values * factor)
     return [*scaled.values(), *map(from_json, shift.effects)]  # type: ignore[arg-type]
 
 

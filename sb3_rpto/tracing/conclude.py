@@ -163,6 +163,7 @@ def _of_own_steps(set_up: SetUp, found: Found, declared: Sequence[str], threads:
     known = [i for i, e in enumerate(simulation.effects) if e.known and not isinstance(e, Declared)]
     kept = (*known, *found.selection.model.effects)
     there = [simulation.effects[i].with_values(values[simulation.slices[i]]) for i in kept]
+    there = [effect for effect in there if not effect.does_nothing]  # as known ones may, after the fit
     kind = origin(set_up.nominal, set_up.fitted, declared, set_up.sigma, set_up.length, threads, there)
     if kind == "machine":
         return None

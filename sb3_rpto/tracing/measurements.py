@@ -130,8 +130,9 @@ class Measurements:
                 frame = pandas.read_parquet(path)
             except (ValueError, OSError) as error:  # pyarrow's own of broken files are such
                 raise ValueError(f"{path}: no whole Parquet file ({error}); write it again") from error
-            if any(frame.index.names):  # pandas puts what was its index back there
-                frame = frame.reset_index()
+            index = [name for name in frame.index.names if name is not None and name not in frame.columns]
+            if index:  # pandas puts what was its index back there
+                frame = frame.reset_index(index)
             tables[path] = {name: frame[name].to_numpy() for name in frame.columns}
         return cls.from_tables(tables)
 
@@ -371,6 +372,10 @@ def _read_csv(path: str) -> dict[str, np.ndarray]:
             rows = [row for row in csv.reader(stream) if row]
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise ValueError(f"{path}: no whole gzip file ({error}); write it again") from error
+    except csv.Error as error:
+        raise ValueError(
+            f"{path}: no CSV ({error}); is a quote left open, or its end torn? Correct that row"
+        ) from error
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: no text in UTF-8 ({error}); save the table as CSV in UTF-8") from error
     if not rows:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -192,8 +192,12 @@ class Report:
 
     @property
     def correction(self) -> list[Effect]:
-        """Declared parameters and effects with the values found: what the corrected model needs."""
-        return [t.effect for t in (*self.declared, *self.effects)]
+        """Declared parameters and effects with the values found: what the corrected model needs.
+
+        A known effect that turned out to do nothing is left out.
+        """
+        found = [t.effect for t in (*self.declared, *self.effects)]
+        return [effect for effect in found if isinstance(effect, Declared) or not effect.does_nothing]
 
     def apply(self, env: gym.Env) -> gym.Env:
         """A corrected copy of a gymnasium MuJoCo environment, for RPTO, SAC, anything; ``env`` stays as it is."""
@@ -209,6 +213,8 @@ class Report:
         """
         if self.zeros is None:
             raise ValueError("no encoder's zero was found to differ by run; predict the runs as they are")
+        # A joint that was at rest in the recordings says as little here.
+        data = replace(data, unobserved=tuple(dict.fromkeys((*data.unobserved, *self.data.unobserved))))
         return zeros_of(self.simulation, self.values_after, data, self.sigma, self.horizon, self.zeros.joints)
 
     def __str__(self) -> str:

@@ -68,7 +68,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     qpos, qvel, shown = _motion(simulation.model, data, e, time, h, low)
     for effect, x in reversed([pair for pair in active if pair[0].senses]):
         _undo_sensor(effect, np.repeat(x, len(time), axis=0), time, qpos, qvel)
-    commands, enabled = _commands(simulation.model, data, e, time)
+    commands, enabled = _commands(simulation.model, data, e, time, h)
     commands = filter_commands(active, commands[None], h)[0]
     settings = simulation.from_settings({name: np.array([value]) for name, value in e.params.items()})
     world = BatchWorld(simulation.model, 1, 1)
@@ -106,9 +106,14 @@ def _motion(
     return qpos, qvel, shown
 
 
-def _commands(model: mujoco.MjModel, data: Measurements, e: Episode, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The commands that are held at uniform times, and which actuators are enabled; (T, nu) each."""
-    row = np.clip(np.searchsorted(e.time, time + 1e-9, side="right") - 1, 0, len(e) - 1)
+def _commands(
+    model: mujoco.MjModel, data: Measurements, e: Episode, time: np.ndarray, h: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The commands of the samples nearest to uniform times, ``h`` apart, and which actuators are enabled; (T, nu) each.
+
+    Recorded clocks are rounded: the last sample before such a time may be the one before that which it is of.
+    """
+    row = np.clip(np.searchsorted(e.time, time + 0.5 * h, side="right") - 1, 0, len(e) - 1)
     commands = np.zeros((len(time), model.nu))
     enabled = np.ones_like(commands)
     order = command_order(model, data)

@@ -267,14 +267,15 @@ def _build(
         t0 = e.time[begin]
         qpos[w], qvel[w], qacc[w], spread[w] = start_state(model, data, e, begin, sigma, addresses, loose[w])
         grid = t0 + h * np.arange(-before, steps)
-        row = np.clip(np.searchsorted(e.time, grid + 1e-6 * h, side="right") - 1, 0, len(e) - 1)
+        # Clocks are rounded, by up to microseconds: a sample is of the step of the grid that it lies nearest to.
+        row = np.clip(np.searchsorted(e.time, grid + 0.5 * h, side="right") - 1, 0, len(e) - 1)
         commands[w][:, actuators] = (
             e.ctrl[row]
             if data.exact or data.simulated
             else held(e.time, e.ctrl, np.append(grid, grid[-1] + h) - half_step(model))
         )
         if data.idle and not e.after_gap:
-            commands[w][grid < e.time[0] - 1e-6 * h] = 0
+            commands[w][grid < e.time[0] - 0.5 * h] = 0
         enabled[w][:, actuators] = e.enabled[row[before:]]
         n = end - begin - 1
         at[w, :n] = np.minimum((e.time[begin + 1 : end] - t0) / h, steps)

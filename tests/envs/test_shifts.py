@@ -363,6 +363,26 @@ def test_a_difference_says_what_differs():
     assert (cartpole.numbers, cartpole.step) == ({"gravity": ()}, 1)
 
 
+def test_a_body_that_only_one_of_them_has_is_a_difference(tmp_path):
+    source = gym.make("InvertedPendulum-v5")
+    spec = mujoco.MjSpec.from_file(source.unwrapped.fullpath)
+    load = spec.body("pole").add_body(name="load", pos=[0, 0, 0.5])
+    load.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.03, 0, 0], mass=0.5)
+    spec.compile()
+    (tmp_path / "loaded.xml").write_text(spec.to_xml())
+    found = differs(source, gym.make("InvertedPendulum-v5", xml_file=str(tmp_path / "loaded.xml")))
+    assert found
+    assert found.numbers["body_mass"] == ()
+
+
+def test_one_number_under_two_names_is_scaled_by_both():
+    pendulum = gym.make("InvertedPendulum-v5")
+    (nominal,) = pendulum.unwrapped.model.dof_damping[[1]]
+    for other in ("hinge.damping", "joint:hinge.damping"):
+        shifted = EnvShift("x", {"*.damping": 2.0, other: 3.0}).apply(pendulum)
+        assert shifted.unwrapped.model.dof_damping[1] == pytest.approx(6 * nominal)
+
+
 def test_a_number_that_shows_nowhere_is_no_difference():
     """Swimmer's geoms touch nothing, so that their friction may be anything."""
     source = gym.make("rpto/Swimmer-v0")

@@ -1,5 +1,6 @@
 """What recordings turn out to be of: friction that gives way, queues of commands that are empty at a reset."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -39,6 +40,21 @@ def test_friction_that_gives_way_is_not_looked_for_where_no_dry_one_is(monkeypat
     report = trace(OWN, data, ["pole.mass"], candidates=["torque_offset"], simulated=True, threads=1)
     assert report.verdict == "unexplained"
     assert [c.label for c in report.candidates] == ["torque_offset(hinge)"]
+
+
+def test_a_known_effect_that_the_fit_takes_away_is_not_in_what_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    known, found = LIBRARY["coulomb_friction"]("hinge", level=0.1).as_known(), LIBRARY["torque_offset"]("hinge")
+    simulation = SimpleNamespace(effects=[known, found], slices=[slice(0, 1), slice(1, 2)])
+    model = SimpleNamespace(effects=[1], fit=SimpleNamespace(values=np.array([0.0, 0.2])))
+    ended = SimpleNamespace(
+        selection=SimpleNamespace(model=model), on=SimpleNamespace(fine=SimpleNamespace(simulation=simulation))
+    )
+    given: list[Effect] = []
+    monkeypatch.setattr(conclude, "_explains", lambda _: False)
+    monkeypatch.setattr(conclude, "origin", lambda *args: given.extend(args[-1]) or "machine")
+    set_up = SimpleNamespace(nominal=None, fitted=None, sigma=None, length=None)
+    assert conclude._of_own_steps(set_up, ended, [], 1) is None  # type: ignore[arg-type]
+    assert [effect.label for effect in given] == ["torque_offset(hinge)"]
 
 
 class Smooth(gym.Wrapper):

@@ -524,6 +524,9 @@ def test_an_index_of_pandas_is_a_column(tmp_path):
     pd.DataFrame(swing()).set_index("time").to_parquet(tmp_path / "run.parquet")
     (run,) = Measurements.from_parquet(tmp_path / "run.parquet").episodes
     np.testing.assert_array_equal(run.time, swing()["time"])
+    pd.DataFrame(swing()).set_index("time", drop=False).to_parquet(tmp_path / "twice.parquet")
+    (twice,) = Measurements.from_parquet(tmp_path / "twice.parquet").episodes
+    np.testing.assert_array_equal(twice.time, run.time)
 
 
 def test_files_that_are_broken_are_named(tmp_path):
@@ -533,6 +536,9 @@ def test_files_that_are_broken_are_named(tmp_path):
     for name in ("objects", "text"):
         with pytest.raises(ValueError, match=rf"{name}\.npz: "):
             Measurements.from_npz(tmp_path / f"{name}.npz")
+    (tmp_path / "torn.csv").write_bytes(b"time,qpos.hinge\n0.0,1.0\n0.1," + bytes(200_000))
+    with pytest.raises(ValueError, match=r"torn\.csv: no CSV .*its end torn"):
+        Measurements.from_csv(tmp_path / "torn.csv")
     with pytest.raises(ValueError, match=r"text\.parquet: no whole Parquet file"):
         Measurements.from_parquet(tmp_path / "text.parquet")
 

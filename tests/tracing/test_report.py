@@ -133,6 +133,13 @@ def test_saved_model_simulates_as_the_corrected_one(report: Report, planted, tmp
     assert np.abs(nominal[0] - expected[0]).max() > 0.1
 
 
+def test_a_known_effect_that_turned_out_to_do_nothing_is_no_correction(report: Report, tmp_path: Path) -> None:
+    nothing = replace(report.declared[0], effect=CoulombFriction("hinge"))
+    found = replace(report, declared=[*report.declared, nothing], effects=[])
+    assert [e.label for e in found.correction] == [t.label for t in report.declared]
+    assert "coulomb_friction(hinge)" in str(found)
+
+
 def test_a_model_whose_mjcf_is_unknown_is_refused_and_nothing_written(report: Report, tmp_path: Path) -> None:
     compiled = replace(report, source=report.simulation.model)
     with pytest.raises(ValueError, match="give its file"):

@@ -139,6 +139,18 @@ def test_the_actuators_force_is_the_load_and_off_actuators_have_none() -> None:
     assert not residuals(replace(data, episodes=off))[0].load.any()
 
 
+@pytest.mark.parametrize(
+    "rounded", [lambda t: t.astype(np.float32).astype(float), lambda t: t + 1.7e9], ids=["float32", "since 1970"]
+)
+def test_commands_are_those_of_their_samples_on_a_rounded_clock(rounded) -> None:
+    data = swinging([])
+    clocked = replace(data, episodes=[replace(e, time=rounded(e.time)) for e in data.episodes])
+    for exact, found in zip(residuals(data), residuals(clocked)):
+        n = min(len(exact.command), len(found.command))
+        assert n > 500
+        np.testing.assert_array_equal(found.command[:n], exact.command[:n])
+
+
 def test_a_setting_of_a_run_is_in_its_model() -> None:
     heavy = declare(compiled(), ["pole.mass"])[0].with_values(np.array([0.8]))
     data = swinging([heavy])

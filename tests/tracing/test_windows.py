@@ -236,6 +236,24 @@ def test_commands_of_exact_data_are_those_of_the_samples() -> None:
     )
 
 
+@pytest.mark.parametrize("kind", ["simulated", "exact"])
+@pytest.mark.parametrize(
+    "rounded",
+    [lambda t: t.astype(np.float32).astype(float), lambda t: np.round(t, 6), lambda t: t + 1.7e9],
+    ids=["float32", "microseconds", "since 1970"],
+)
+def test_a_rounded_clock_does_not_give_steps_the_commands_of_their_neighbours(rounded, kind: str) -> None:
+    t, u = rounded(clock(1500, 240.0)), np.arange(1500.0)
+    columns = {"ctrl.motor": [u], "qvel.hinge": [np.zeros(1)]}
+    data = replace(measured([t], [np.sin(t - t[0])], **columns), **{kind: True}, idle=True)
+    model = compiled(PENDULUM.replace('"0.005"', f'"{1 / 240!r}"'))
+    windows = cut(model, data, SIGMA, 0.4, 100)
+    begun = np.searchsorted(data.episodes[0].time, windows.time - 1e-9)
+    steps = np.arange(-windows.drive.before, windows.drive.commands.shape[1] - windows.drive.before)
+    row = begun[:, None] + steps
+    np.testing.assert_array_equal(windows.drive.commands[..., 0], np.where(row < 0, 0, np.clip(row, 0, 1499)))
+
+
 @pytest.mark.parametrize("jitter", [0.0, 0.7])
 def test_samples_keep_their_own_times(jitter: float) -> None:
     t = clock(500, 200.0, jitter)

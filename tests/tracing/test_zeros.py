@@ -111,6 +111,14 @@ def test_a_corrected_model_tells_the_zeros_of_other_runs() -> None:
         traced(0.0, 0.0, 0.05).zeros_of(new)
 
 
+def test_a_joint_that_was_at_rest_says_nothing_of_new_zeros(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr("sb3_rpto.tracing.report.zeros_of", lambda *args: seen.append(args[2]))
+    report = traced(0.0, 1.0)
+    replace(report, data=replace(report.data, unobserved=("hinge",))).zeros_of(runs())
+    assert seen[0].unobserved == ("hinge",)
+
+
 def test_every_run_is_told_its_zero_and_one_without_a_window_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_rpto.tracing.zeros.TRAIN", 2)
     monkeypatch.setattr("sb3_rpto.tracing.zeros.SELECT", 1)
