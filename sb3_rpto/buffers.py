@@ -146,9 +146,12 @@ class DualReplayBuffer(ReplayBuffer):
     def resize_source(self, capacity: int) -> None:
         """Give the source side another capacity; the newest transitions that fit are kept.
 
+        A class of the user's, which may keep what came in ``infos``, stays as large as it is once it holds some.
+
         :param capacity: in transitions
         """
-        if capacity == self.source.buffer_size:
+        foreign = type(self.source).add is not ReplayBuffer.add and self.source.size() > 0
+        if capacity == self.source.buffer_size or foreign:
             return
         kept = {name: array[-capacity:] for name, array in chronological(self.source).items()}
         self.source = self._make_side(buffer_size=capacity, device=self.device)

@@ -203,6 +203,16 @@ def test_a_buffer_class_of_the_users_sees_the_infos():
     assert buffer.target.timeouts[1, 0] == 1
 
 
+def test_what_such_a_class_keeps_is_not_lost_by_a_new_capacity():
+    space = spaces.Box(-1, 1, (2,))
+    buffer = DualReplayBuffer(10, space, space, side_class=Costly)
+    buffer.resize_source(30)
+    rows = np.zeros((20, 2), dtype=np.float32)
+    buffer.append("source", rows, rows, rows, *np.zeros((3, 20)), [{"cost": i} for i in range(20)])
+    buffer.resize_source(10)
+    assert (buffer.source.costs, buffer.source.size()) == (list(range(20)), 20)
+
+
 def test_time_limits_end_episodes_where_nobody_handles_them():
     buffer = DualReplayBuffer(10, OBS, ACT, device="cpu", handle_timeout_termination=False)
     for world in ("source", "target"):

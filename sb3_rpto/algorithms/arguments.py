@@ -294,6 +294,20 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
         )
 
 
+def warn_of_idle_source_phase(model: TwoWorlds, source_timesteps: int) -> None:
+    """Say so where the source phase ends before its first update, and an untrained policy goes into the target.
+
+    :param source_timesteps: its length; 0: nobody wants one
+    """
+    if 0 < source_timesteps <= model.learning_starts:
+        warnings.warn(
+            f"the source phase of {source_timesteps:,} steps ends before its first update (learning_starts="
+            f"{model.learning_starts:,}), so an untrained policy goes into the target; give learn() more "
+            "source_timesteps, a smaller learning_starts, or begin from a trained SAC by from_source()",
+            stacklevel=3,
+        )
+
+
 def _warn_of_little(model: TwoWorlds, total_timesteps: int) -> None:
     """Say so where the budget ends before the dynamics are fitted, or with next to no updates."""
     if model._offline:

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 
 from sb3_rpto.algorithms.listeners import count_in_target
 from sb3_rpto.algorithms.machine import check_machine, check_simulator, doubt, doubt_rules
+from sb3_rpto.algorithms.normalisation import check_normalisation, normalises, rescaled
 from sb3_rpto.algorithms.snapshots import PolicySnapshots
 from sb3_rpto.algorithms.source import SourceWorld
 from sb3_rpto.algorithms.worlds import (
@@ -28,7 +29,7 @@ from sb3_rpto.algorithms.worlds import (
     check_finite,
     check_pair,
     find_ledger,
-    raw_terminal,
+    last_observations,
     share_normalisation,
 )
 from sb3_rpto.dynamics.base import Transitions
@@ -216,7 +217,12 @@ class TwoWorlds(PolicySnapshots):
         check_simulator(source, self.dynamics)
         if self.target_env is not None:
             self._check_pair(source, find_ledger(self.target_env).venv)
-        last_obs = self._last_obs
+        before, after, last_obs = self.get_vec_normalize_env(), unwrap_vec_normalize(source), self._last_obs
+        had = (self._resume_state or {}).get("normalised") if self.env is None else normalises(before)
+        if had is not None and (self.num_timesteps or self._pretrained_steps):
+            check_normalisation(had, after, "the model", before)
+        if self.env is not None and last_obs is not None and after is not before:
+            last_obs, self._last_original_obs = rescaled(last_obs, self._last_original_obs, before, after)
         super().set_env(source, force_reset)
         self._bind_rules(source, of_target=False)
         self._last_obs = last_obs  # SB3 forgets the observation of what it takes to be the training env
@@ -286,7 +292,9 @@ class TwoWorlds(PolicySnapshots):
         self._last_episode_starts = np.ones(n_envs, dtype=bool)
         normaliser = unwrap_vec_normalize(self.target_env)
         self._last_original_obs = None if normaliser is None else np.asarray(normaliser.get_original_obs())
-        check_finite("target", observation=self._last_obs)
+        check_finite(
+            "target", observation=np.asarray(self._last_obs if normaliser is None else self._last_original_obs)
+        )
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         """As SB3's, with what counts environments counting the target's, not the source's."""
@@ -342,14 +350,17 @@ class TwoWorlds(PolicySnapshots):
     ) -> None:
         """Store a target transition as SB3 does, after a look at it."""
         assert self.target_env is not None
-        ended = [info["terminal_observation"] for info, done in zip(infos, dones) if done]  # new_obs is the reset's
-        find_ledger(self.target_env).check(np.asarray([*new_obs, *ended]), reward)
+        ended = last_observations("target", self.target_env, dones, infos)
+        normaliser = unwrap_vec_normalize(self.target_env)
+        raw: Any = new_obs, reward
+        if normaliser is not None:  # which clips what is infinite, and what is stored comes from below it
+            raw = normaliser.get_original_obs(), normaliser.get_original_reward()
+        find_ledger(self.target_env).check(*map(np.asarray, raw), *ended.values())
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        if unwrap_vec_normalize(self.target_env) is not None:  # what SB3 stores is clipped then
+        if normaliser is not None:  # what SB3 stores is clipped then
             side = self.replay_buffer.target
-            for i in np.flatnonzero(dones):
-                row = (side.pos - len(dones) + i) % side.buffer_size
-                side.next_observations[row, 0] = raw_terminal(self.target_env, i, infos[i]["terminal_observation"])
+            for i, observation in ended.items():
+                side.next_observations[(side.pos - len(dones) + i) % side.buffer_size, 0] = observation
         find_ledger(self.target_env).unstored = False
         if self._null_check is not None:
             self._compare_with_source(self._null_check, buffer_action, dones)

@@ -95,7 +95,8 @@ class Resumable(TwoWorlds):
         kept = self.replay_buffer
         try:
             super().load_replay_buffer(path, truncate_last_traj)
-        except pickle.UnpicklingError as error:
+        except (pickle.UnpicklingError, EOFError, AssertionError) as error:  # SB3 sets it, then asserts that it is one
+            self.replay_buffer = kept
             raise ValueError(f"{path} is no replay buffer; pass what save_replay_buffer() wrote") from error
         if not isinstance(self.replay_buffer, DualReplayBuffer):
             self.replay_buffer = kept
@@ -303,6 +304,12 @@ def resume_source_phase(model: Resumable) -> None:
     if state is None:
         return
     assert model.env is not None  # learn() has checked
+    if model._pretrained_steps > 0 and model.replay_buffer.source.size() == 0:
+        warnings.warn(
+            "the source phase goes on without its replay buffers: updates wait for learning_starts new steps; call "
+            "load_replay_buffer() with what save_replay_buffer() wrote beside the checkpoint before learn()",
+            stacklevel=3,
+        )
     _put_env_back(model, model.env, state)
     _go_on_drawing(model, state)
     model._source_first_obs = np.asarray(model.env.reset())

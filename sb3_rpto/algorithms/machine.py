@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from copy import deepcopy
 from itertools import zip_longest
+from typing import Any
 
 import gymnasium as gym
 import mujoco
@@ -18,6 +18,7 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.simulator import check_source
 from sb3_rpto.effects.model import differing, sites_act
+from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import layers, mujoco_model, single_env, state_map
 from sb3_rpto.tracing.columns import columns_of
 
@@ -29,8 +30,8 @@ LARGE = 0.5
 FAR, ROUNDING, MANY, MOST = 0.1, 1e-3, 0.1, 0.5
 #: And on more transitions than these.
 FEW = 2
-#: States that observation wrappers are shown.
-DRAWN = 64
+#: States that observation wrappers are shown, and how often in a row: sensors that are late show the last of them.
+DRAWN, HELD = 64, 16
 
 
 def check_machine(source: VecEnv, target: VecEnv) -> None:
@@ -53,8 +54,8 @@ def check_machine(source: VecEnv, target: VecEnv) -> None:
                 f"target_env has {_joint(other)} where env has {_joint(mine)}: phi would be fitted to the states of "
                 "another machine; give both the same joints in the same order, or pass dynamics='ensemble'"
             )
-    mine, other = map(_dt, envs)
-    if not math.isclose(mine, other, rel_tol=1e-6):
+    mine, other = (getattr(env.unwrapped, "dt", None) for env in envs)
+    if mine is not None and other is not None and not math.isclose(mine, other, rel_tol=1e-6):
         raise ValueError(
             f"a step of target_env takes {other:g} s, one of env {mine:g} s, which no number of the model makes up "
             "for; build both with the same frame_skip times timestep"
@@ -65,16 +66,18 @@ def check_machine(source: VecEnv, target: VecEnv) -> None:
 def _check_observations(source: gym.Env, target: gym.Env) -> None:
     """Refuse observation wrappers of the target with which they no longer hold its state as the source's do.
 
-    They are shown drawn states of a copy: the target itself is not touched. Noise passes.
+    Those of a copy are shown drawn states: the target itself is not touched. Noise passes, and so does what is late.
     """
-    wrappers = [layer for layer in layers(target) if isinstance(layer, gym.ObservationWrapper)]
-    if not wrappers or not hasattr(target.unwrapped, "_get_obs"):
-        return
+    copied = copy_env(target)
+    wrappers = [layer for layer in layers(copied or target) if isinstance(layer, gym.ObservationWrapper)]
+    if copied is None or not wrappers or not hasattr(copied.unwrapped, "_get_obs"):
+        return  # what cannot be read, or copied, is judged by its errors later: :func:`doubt`
     try:
-        recover, twin = state_map(source), deepcopy(target.unwrapped)
-    except Exception:  # what cannot be read, or copied, is judged by its errors later: :func:`doubt`
+        recover = state_map(source)
+    except ValueError:
         return
-    model, data = mujoco_model(twin), twin.data  # type: ignore[attr-defined]
+    twin: Any = copied.unwrapped
+    model, data = mujoco_model(twin), twin.data
     rng = np.random.default_rng(0)
     plain: list[np.ndarray] = []
     seen: list[np.ndarray] = []
@@ -83,10 +86,11 @@ def _check_observations(source: gym.Env, target: gym.Env) -> None:
         mujoco.mj_integratePos(model, data.qpos, rng.uniform(-0.2, 0.2, model.nv), 1.0)
         data.qvel[:] = rng.uniform(-0.5, 0.5, model.nv)
         mujoco.mj_forward(model, data)
-        observation = twin._get_obs()
-        plain.append(observation)
-        for wrapper in reversed(wrappers):
-            observation = wrapper.observation(observation)
+        plain.append(twin._get_obs())
+        for _ in range(HELD):
+            observation = twin._get_obs()
+            for wrapper in reversed(wrappers):
+                observation = wrapper.observation(observation)
         seen.append(observation)
     true, read = (np.concatenate(recover(np.array(shown))[:2], axis=1) for shown in (plain, seen))
     # Coordinates that were exchanged err by 1.4 times what they vary by; unknown ones are NaN.
@@ -127,10 +131,6 @@ def check_simulator(source: VecEnv, dynamics: Dynamics | None) -> None:
 
 def _joint(name: str | None) -> str:
     return "no further joint" if name is None else f"the joint {name!r}"
-
-
-def _dt(env: gym.Env) -> float:
-    return float(env.unwrapped.dt)  # type: ignore[attr-defined]
 
 
 def doubt(dynamics: Dynamics, error: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -32,6 +33,18 @@ def check_normalisation(had: bool, given: VecNormalize | None, what: str, learne
     else:
         return
     warnings.warn(f"{what} saw {said}", stacklevel=4)
+
+
+def rescaled(
+    seen: Any, original: Any, before: VecNormalize | None, after: VecNormalize | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """An observation as another VecNormalize shows it, and its original where there is one.
+
+    :param seen: as ``before`` showed it
+    :param original: of it, where ``before`` is one
+    """
+    raw = np.asarray(seen if before is None else original)
+    return (raw, None) if after is None else (np.asarray(after.normalize_obs(raw)), raw)
 
 
 def _alike(own: VecNormalize, given: VecNormalize) -> bool:

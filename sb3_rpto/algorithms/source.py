@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_rpto.algorithms.update import RelativeUpdate
-from sb3_rpto.algorithms.worlds import check_finite, raw_terminal, share_normalisation
+from sb3_rpto.algorithms.worlds import check_finite, last_observations, share_normalisation
 from sb3_rpto.dynamics.base import Dynamics, Prediction
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
@@ -129,8 +129,8 @@ class EpisodeSource(SourceWorld):
             self._last_raw = raw_next.copy()
             if normaliser is not None:
                 rewards = normaliser.get_original_reward()
-            for i in np.flatnonzero(dones):
-                raw_next[i] = raw_terminal(self.env, i, infos[i]["terminal_observation"])
+            for index, ended in last_observations("source", self.env, dones, infos).items():
+                raw_next[index] = ended
             check_finite("source", observation=raw_next, reward=rewards)
             timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
             scaled = model.policy.scale_action(actions)
@@ -188,7 +188,6 @@ class SimulatorSource(EpisodeSource):
     """
 
     def __init__(self, dynamics: PhysicalDynamics, env: VecEnv, num_envs: int) -> None:
-        dynamics.attach(env)
         self.dynamics = dynamics
         self.copies = [StandingEnv(copied(env), dynamics.effects()) for _ in range(num_envs)]
         # What episodes earn is told by a Monitor, which SB3 puts around single environments, not around a VecEnv's.

@@ -281,6 +281,8 @@ class TransferAlgorithm(Looping):
     def _make_source_world(self) -> SourceWorld:
         """The world that step 3 acts in."""
         assert self.env is not None  # learn() has checked
+        if self.dynamics is not None and self.weighting == "value_aware":  # which asks for single steps
+            self.dynamics.attach(self.env)
         return make_source_world(self.env, self.dynamics, self.rollout_start, int(self.source_steps))
 
     @classmethod
@@ -344,6 +346,8 @@ class TransferAlgorithm(Looping):
         arguments.check_ready(self, total_timesteps, source_timesteps)
         if source_timesteps is None:
             source_timesteps = min(10 * total_timesteps, 300_000)
+        if not self._warm:
+            arguments.warn_of_idle_source_phase(self, source_timesteps)
         self._store_step_cut_off()
         if reset_num_timesteps and self._warm:  # else the source phase goes on all the same
             checkpoint.leave(self)

@@ -224,7 +224,8 @@ def _train_in_source(model: Resumable, source_timesteps: int, progress_bar: bool
             steps = source.interact(model, 1, random=warming_up and not explores)
             model._pretrained_steps += steps
             model.source_timesteps += steps
-            if model._pretrained_steps > model.learning_starts:
+            # Also where it goes on without its buffers: the policy would be fitted to a handful of transitions.
+            if model.replay_buffer.source.size() > model.learning_starts:
                 model.train(steps, model.batch_size)
             if bar is not None:
                 bar.update(steps)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -58,13 +58,19 @@ class TargetLedger(VecEnvWrapper):
         self.disturbed = self._stepping = False
         self._left_at = whereabouts(self.venv)
 
-    def check(self, observations: np.ndarray, rewards: np.ndarray) -> None:
+    def check(self, observations: np.ndarray, rewards: np.ndarray, *ended: np.ndarray) -> None:
         """Look at what the target answered; if it cannot be stored, its step and its episode are given up.
+
+        :param observations: after the step, or of the reset that followed
+        :param rewards: of the step
+        :param ended: observations at the ends of episodes
 
         :raises ValueError: for what is not finite
         """
         try:
             check_finite("target", observation=observations, reward=rewards)
+            for observation in ended:
+                check_finite("target", observation=observation)
         except ValueError:
             self.unstored, self.disturbed = False, True
             raise
@@ -159,7 +165,31 @@ def share_normalisation(venv: VecEnv, source: VecEnv | None) -> VecEnv:
     return shared
 
 
-def raw_terminal(env: VecEnv, index: Any, terminal: np.ndarray) -> np.ndarray:
+def last_observations(
+    world: str, env: VecEnv, dones: np.ndarray, infos: Sequence[dict[str, Any]]
+) -> dict[int, np.ndarray]:
+    """The observations at the ends of episodes as the environments gave them, by the index of the environment.
+
+    What a step returns there is of the episode that follows.
+
+    :param world: what to call it
+    :param env: the world's VecEnv with all its wrappers, just stepped
+    :param dones: (n,), whether an episode ended
+    :param infos: (n,), what came with it
+    :raises ValueError: a VecEnv that does not tell
+    """
+    found = {}
+    for i in map(int, np.flatnonzero(dones)):
+        if "terminal_observation" not in infos[i]:
+            raise ValueError(
+                f"the {world}'s VecEnv ended an episode without info['terminal_observation'], so its last transition "
+                "is unknown; put it there, as the VecEnvs of Stable-Baselines3 do"
+            )
+        found[i] = _raw_terminal(env, i, infos[i]["terminal_observation"])
+    return found
+
+
+def _raw_terminal(env: VecEnv, index: int, terminal: np.ndarray) -> np.ndarray:
     """The observation at the end of an episode as the environment gave it.
 
     A VecNormalize clips what it hands on: far out states, such as falls are, cannot be had back from that. A

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
 from sb3_rpto.dynamics.onestep import BLOWN, OneStep, Steps, as_steps
+from sb3_rpto.dynamics.simulator import check_memoryless
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.effect import from_json
@@ -248,11 +249,12 @@ class PhysicalDynamics(Dynamics):
     def attach(self, env: gym.Env | VecEnv) -> None:
         """Give the environment whose rewards, terminations and observations :meth:`step` answers with; it is copied.
 
-        :raises ValueError: it cannot be copied
+        :raises ValueError: it cannot be copied, or its answer to a step does not follow from the state before it
         """
         twin = copy_env(single_env(env))
         if twin is None:
             raise ValueError(f"{env} cannot be copied; give dynamics='physical' an environment that can")
+        check_memoryless(single_env(env), self.recover)
         twin.reset(seed=0)
         self._twin = StandingEnv(twin, self.effects())
 

@@ -20,7 +20,7 @@ from sb3_rpto.envs.observations import (
     state_map,
     strange_wrapper,
 )
-from sb3_rpto.envs.steps import odd_state, odd_step
+from sb3_rpto.envs.steps import odd_memory, odd_state, odd_step
 
 
 def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
@@ -62,6 +62,23 @@ def check_source(env: gym.Env | VecEnv) -> StateMap:
     check_step(single, int(frame_skip))
     check_states(single, recover)
     return recover
+
+
+def check_memoryless(env: gym.Env, recover: StateMap) -> None:
+    """Require that the answer to a single step follows from the observation before it.
+
+    :param env: a MuJoCo environment with all its wrappers; untouched
+    :param recover: states from its observations
+    :raises ValueError: an observation or a reward that tells of something else
+    """
+    found = odd_memory(env, recover)
+    if found is not None:
+        raise ValueError(
+            f"{env_name(env)}: after a step {found} depends on more than the state before it (a goal that is drawn at "
+            "a reset?), which single steps from recorded states would lack; make it a part of the model that is "
+            "observed, or use dynamics='physical' without weighting='value_aware', which simulates whole episodes, or "
+            "dynamics='ensemble'"
+        )
 
 
 def check_commands(env: gym.Env, what: str) -> None:

@@ -1,5 +1,7 @@
 """SB3's accounts in the target: rollouts of whole episodes, the null-shift check."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from conftest import OURS, SMALL_ENSEMBLE, SMALL_POLICY, small
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPO, RPTO
 from sb3_rpto.buffers import chronological
@@ -185,6 +187,80 @@ def test_a_source_phase_that_goes_on_begins_a_new_episode(n_envs):
     rows = chronological(model.replay_buffer.source)
     assert len(rows["rewards"]) >= 150
     assert_moves_as_a_pendulum(rows)
+
+
+class Silent(DummyVecEnv):
+    """Does not tell how episodes end."""
+
+    def step_wait(self):
+        *answer, infos = super().step_wait()
+        for info in infos:
+            info.pop("terminal_observation", None)
+        return *answer, infos
+
+
+@pytest.mark.parametrize("world", ["source", "target"])
+def test_an_end_that_a_vec_env_does_not_tell_is_named(world):
+    worlds = {"source": short(10.0), "target": short(12.0), world: Silent([short])}
+    with pytest.raises(
+        ValueError, match=rf"the {world}'s VecEnv ended an episode without info\['terminal_observation'\]"
+    ):
+        small(RPO, worlds["source"], worlds["target"], learning_starts=5).learn(12, source_timesteps=12)
+
+
+class Broken(gym.Wrapper):
+    """Its fifth answer is infinite, which a VecNormalize clips."""
+
+    def __init__(self, env, what, at=5):
+        super().__init__(env)
+        self.what, self.at, self.steps = what, at, 0
+
+    def reset(self, **kwargs):
+        observation, info = super().reset(**kwargs)
+        return (observation + np.float32(np.inf) if self.at == 0 else observation), info
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        self.steps += 1
+        if self.steps == self.at and self.what == "observation":
+            observation = observation + np.float32(np.inf)
+        return observation, (np.inf if self.steps == self.at and self.what == "reward" else reward), *rest
+
+
+@pytest.mark.parametrize(("what", "at"), [("observation", 5), ("reward", 5), ("observation", 8), ("observation", 0)])
+def test_what_is_not_finite_in_the_target_is_refused_behind_a_normalisation(what, at):
+    source = VecNormalize(DummyVecEnv([lambda: short(10.0)]))
+    made = small(RPO, source, Broken(short(), what, at))
+    with pytest.raises(ValueError, match=f"the target environment returned, as {what}, what is not finite"):
+        made.learn(20, source_timesteps=0)
+    kept = chronological(made.replay_buffer.target)
+    assert len(kept["rewards"]) == max(at - 1, 0)
+    assert all(np.isfinite(values).all() for values in kept.values())
+
+
+def test_a_source_phase_without_an_update_is_told():
+    with pytest.warns(
+        UserWarning, match=r"source phase of 20 steps ends before its first update \(learning_starts=20\)"
+    ):
+        small(RPO, learning_starts=20).learn(2)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="the source phase")
+        small(RPO, learning_starts=20).learn(2, source_timesteps=21)
+        small(RPO, learning_starts=20).learn(2, source_timesteps=0)  # nobody wants one
+
+
+@pytest.mark.parametrize("normalised", [True, False])
+def test_another_normalisation_is_told_and_the_episode_goes_on_in_it(normalised):
+    def world(normalised):
+        venv = DummyVecEnv([lambda: gym.make("Pendulum-v1")])
+        return VecNormalize(venv) if normalised else venv
+
+    made = small(RPO, world(normalised), gym.make("Pendulum-v1", g=12.0)).learn(20, source_timesteps=0)
+    with pytest.warns(UserWarning, match="the model saw .*env"):
+        made.set_env(world(not normalised))
+    made.learn(10, reset_num_timesteps=False)
+    assert_moves_as_a_pendulum(chronological(made.replay_buffer.target))
+    np.testing.assert_allclose(np.linalg.norm(made.replay_buffer.target.observations[:30, 0, :2], axis=1), 1, atol=1e-5)
 
 
 def test_a_source_that_is_refused_changes_nothing():

@@ -1,6 +1,7 @@
 """A checkpoint is complete: resuming equals not having stopped."""
 
 import contextlib
+import pickle
 import tempfile
 import threading
 import warnings
@@ -292,6 +293,12 @@ def test_a_killed_source_phase_goes_on_from_its_checkpoint(tmp_path):
     assert resumed.replay_buffer.source.size() == done
     resumed.learn(5, source_timesteps=300)
     assert resumed._pretrained_steps == 300
+    forgetful = RPO.load(tmp_path / "pretrain.zip", env=pendulum(), target_env=pendulum(12.0))
+    held, train = [], forgetful.train
+    forgetful.train = lambda *args: held.append(forgetful.replay_buffer.source.size()) or train(*args)
+    with pytest.warns(UserWarning, match="the source phase goes on without its replay buffers"):
+        forgetful.learn(5, source_timesteps=300)
+    assert held[0] == forgetful.learning_starts + 1
 
 
 def test_a_source_phase_leaves_nothing_where_no_folder_was_given(tmp_path, monkeypatch):
@@ -420,6 +427,12 @@ def test_files_and_arguments_that_load_cannot_take_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"m.zip is no replay buffer; pass what save_replay_buffer\(\) wrote"):
         model.load_replay_buffer(tmp_path / "m.zip")
     assert model.replay_buffer is kept
+    (tmp_path / "statistics.pkl").write_bytes(pickle.dumps({"mean": 0.0}))
+    (tmp_path / "torn.pkl").write_bytes(pickle.dumps([1.0] * 100)[:50])
+    for name in ("statistics", "torn"):
+        with pytest.raises(ValueError, match=rf"{name}.pkl is no replay buffer"):
+            model.load_replay_buffer(tmp_path / f"{name}.pkl")
+        assert model.replay_buffer is kept
 
 
 #: SLBO's model is no ensemble.

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch as th
-from gymnasium.wrappers import FlattenObservation, TimeLimit, TransformObservation, TransformReward
+from gymnasium.wrappers import DelayObservation, FlattenObservation, TimeLimit, TransformObservation, TransformReward
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_rpto import RPTO
@@ -93,6 +93,43 @@ def test_observations_that_a_wrapper_makes_another_states_are_refused_untouched(
 def test_noise_of_the_target_is_no_other_state():
     target, rng = gym.make(POLES), np.random.default_rng(0)
     model(TransformObservation(target, lambda o: o + rng.normal(0, 0.05, o.shape), target.observation_space))
+
+
+@pytest.mark.parametrize("delay", [1, 4])
+def test_late_sensors_of_the_target_are_no_other_state_and_remember_nothing_of_the_look(delay):
+    late, twin = (DelayObservation(gym.make(POLES), delay=delay) for _ in range(2))
+    for env in (late, twin):
+        env.reset(seed=0)
+    model(late)
+    shown, expected = (env.step(np.zeros(1, dtype=np.float32))[0] for env in (late, twin))
+    np.testing.assert_array_equal(shown, expected)
+    assert len(late.observation_queue) == len(twin.observation_queue)
+
+
+class Handmade(gym.Env):
+    """A machine that somebody simulates by MuJoCo without gymnasium's class for it."""
+
+    def __init__(self):
+        twin = gym.make("InvertedPendulum-v5").unwrapped
+        self.model, self.data = twin.model, twin.data
+        self.observation_space, self.action_space = twin.observation_space, twin.action_space
+
+    def _seen(self):
+        return np.concatenate([self.data.qpos, self.data.qvel])
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        return self._seen(), {}
+
+    def step(self, action):
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, 2)
+        return self._seen(), 1.0, False, False, {}
+
+
+def test_a_target_that_does_not_tell_its_time_step_passes():
+    model(Handmade(), "pole.mass", "InvertedPendulum-v5")
 
 
 @pytest.mark.slow

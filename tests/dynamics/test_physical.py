@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces, wrappers
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from shifted import HOPPER, POLE, POLES, SHIFTS, collect, joined, noisy, shifted
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_rpto import RPTO
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.env import DynamicsEnv
 from sb3_rpto.dynamics.physical import PhysicalDynamics
@@ -553,6 +555,44 @@ def test_a_step_is_the_corrected_environments_own(env_id, sensor):
     np.testing.assert_array_equal(said.terminations, data.terminations.bool())
     assert said.next_observations.dtype == data.observations.dtype
     np.testing.assert_array_equal(model.step(data.observations, data.actions).rewards, said.rewards)
+
+
+class Reaching(InvertedPendulumEnv):
+    """Each episode has a goal of its own for the cart, which is no part of the model."""
+
+    goal, shown = 0.0, True
+
+    def __init__(self, shown=True):
+        super().__init__()
+        self.shown = shown
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (4 + shown,), np.float64)
+
+    def reset_model(self):
+        self.goal = float(self.np_random.uniform(-0.5, 0.5))
+        return super().reset_model()
+
+    def _get_obs(self):
+        return np.concatenate([self.data.qpos, self.data.qvel, [self.goal] * self.shown])
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, -abs(observation[0] - self.goal), *rest
+
+
+@pytest.mark.parametrize(("shown", "named"), [(True, r"observation\[4\]"), (False, "the reward")])
+def test_a_goal_that_each_reset_draws_is_refused_where_single_steps_would_lack_it(shown, named):
+    def recover(obs):
+        known = np.ones((len(obs), 2), dtype=bool)
+        return States(obs[:, :2], obs[:, 2:4], known, known)
+
+    register_state_map(Reaching, lambda env: recover)
+    worlds = {"env": Reaching(shown), "target_env": Reaching(shown)}
+    settings = {"declared": ["pole.mass"], "policy_kwargs": {"net_arch": [8]}, "source_steps": 4, "device": "cpu"}
+    with pytest.raises(ValueError, match=f"after a step {named} depends on more than the state"):
+        RPTO("MlpPolicy", **worlds, dynamics="residual", **settings).learn(4, source_timesteps=0)
+    with pytest.raises(ValueError, match=f"after a step {named} depends on more than the state"):
+        RPTO("MlpPolicy", **worlds, dynamics="physical", weighting="value_aware", **settings).learn(4)
+    RPTO("MlpPolicy", **worlds, dynamics="physical", **settings).learn(4, source_timesteps=0)
 
 
 def test_steps_do_not_touch_the_environment_they_were_given():
