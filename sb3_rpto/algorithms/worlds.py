@@ -64,7 +64,6 @@ class TargetLedger(VecEnvWrapper):
         :param observations: after the step, or of the reset that followed
         :param rewards: of the step
         :param ended: observations at the ends of episodes
-
         :raises ValueError: for what is not finite
         """
         try:
