@@ -19,8 +19,9 @@ TRIED = 3
 KNOWN = ("qpos", "qvel", "act", "history", "qacc_warmstart")
 #: Episodes and steps of each whose states are compared with what the observations are said to show.
 SHOWN, STEPS = 3, 10
-#: Episodes whose first steps are compared with those of others.
-EPISODES = 8
+#: Episodes whose first steps are compared with those of others; more than noise tells them apart where they differ by
+#: this many times as much as steps of one episode.
+EPISODES, BEYOND = 8, 3.0
 #: A coordinate is wrong where it is off by more than this share of how far the coordinate moves, and by this much.
 OFF, LEAST = 0.5, 1e-3
 
@@ -104,7 +105,7 @@ def odd_memory(env: gym.Env, recover: StateMap) -> str | None:
     """What a step answers from more than the state that was observed before it; None where nothing is found.
 
     The first steps of episodes are compared with those from the same states in other episodes: a goal, say, that a
-    reset draws and keeps beside the model is another one there.
+    reset draws and keeps beside the model is another one there. What differs as much within one is noise.
 
     :param env: a MuJoCo environment; untouched
     :param recover: states from its observations
@@ -118,13 +119,22 @@ def odd_memory(env: gym.Env, recover: StateMap) -> str | None:
     for seed in range(EPISODES):
         observation, _ = one.reset(seed=seed)
         other.reset(seed=EPISODES + seed)
-        states = recover(np.asarray(observation, dtype=float)[None])
-        base.set_state(np.nan_to_num(states.qpos[0]), np.nan_to_num(states.qvel[0]))
+        states, data = recover(np.asarray(observation, dtype=float)[None]), one.unwrapped.data
+        qpos, qvel = np.nan_to_num(states.qpos[0]), np.nan_to_num(states.qvel[0])
+        # Again from as far on the other side of the true state: off by noise, in the observation before the step, too.
+        mirrored = (
+            np.where(states.known_qpos[0], 2 * data.qpos - qpos, qpos),
+            np.where(states.known_qvel[0], 2 * data.qvel - qvel, qvel),
+        )
         action = one.action_space.sample()
-        stepped = [twin.step(action) for twin in (one, other)]
+        stepped = [one.step(action)]
+        for state in ((qpos, qvel), mirrored):
+            base.set_state(*state)
+            stepped.append(other.step(action))
         answers.append([[*observation, reward] for observation, reward, *_ in stepped])
-    true, found = np.array(answers, dtype=float).transpose(1, 0, 2)
-    wrong = np.sqrt(((found - true) ** 2).mean(axis=0)) > np.maximum(OFF * true.std(axis=0), LEAST)
+    true, found, again = np.array(answers, dtype=float).transpose(1, 0, 2)
+    off, noise = (np.sqrt(((found - against) ** 2).mean(axis=0)) for against in (true, again))
+    wrong = off > np.maximum(np.maximum(OFF * true.std(axis=0), LEAST), BEYOND * noise)
     if not wrong.any():
         return None
     column = int(np.flatnonzero(wrong)[0])

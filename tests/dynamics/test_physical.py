@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces, wrappers
+from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from shifted import HOPPER, POLE, POLES, SHIFTS, collect, joined, noisy, shifted
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -20,13 +21,13 @@ from sb3_rpto import RPTO
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.env import DynamicsEnv
 from sb3_rpto.dynamics.physical import PhysicalDynamics
-from sb3_rpto.dynamics.simulator import physical_config
+from sb3_rpto.dynamics.simulator import check_memoryless, physical_config
 from sb3_rpto.effects import LIBRARY, Declared
 from sb3_rpto.effects.commands import CommandDelay, CommandGain
 from sb3_rpto.effects.friction import StribeckFriction
 from sb3_rpto.effects.sensors import SensorBias
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.envs.observations import States, register_state_map
+from sb3_rpto.envs.observations import States, register_state_map, state_map
 
 
 def dynamics(env_id, declared=None, **kwargs):
@@ -593,6 +594,18 @@ def test_a_goal_that_each_reset_draws_is_refused_where_single_steps_would_lack_i
     with pytest.raises(ValueError, match=f"after a step {named} depends on more than the state"):
         RPTO("MlpPolicy", **worlds, dynamics="physical", weighting="value_aware", **settings).learn(4)
     RPTO("MlpPolicy", **worlds, dynamics="physical", **settings).learn(4, source_timesteps=0)
+
+
+@pytest.mark.parametrize("noise", [0.0005, 0.005, 0.05])
+def test_observations_that_are_noisier_than_resets_are_no_goal(noise):
+    class Noisy(HopperEnv):
+        """Behind sensors with white noise; a reset spreads positions and velocities by 0.005."""
+
+        def _get_obs(self):
+            return super()._get_obs() + self.np_random.normal(0, noise, 11)
+
+    env = Noisy()
+    check_memoryless(env, state_map(gym.make(HOPPER)))
 
 
 def test_steps_do_not_touch_the_environment_they_were_given():
