@@ -113,13 +113,14 @@ def odd_memory(env: gym.Env, recover: StateMap) -> str | None:
     one, other = copy_env(env), copy_env(env)
     if one is None or other is None:
         return None
+    first: Any = one.unwrapped
     base: Any = other.unwrapped
     one.action_space.seed(0)
     answers = []
     for seed in range(EPISODES):
         observation, _ = one.reset(seed=seed)
         other.reset(seed=EPISODES + seed)
-        states, data = recover(np.asarray(observation, dtype=float)[None]), one.unwrapped.data
+        states, data = recover(np.asarray(observation, dtype=float)[None]), first.data
         qpos, qvel = np.nan_to_num(states.qpos[0]), np.nan_to_num(states.qvel[0])
         # Again from as far on the other side of the true state: off by noise, in the observation before the step, too.
         mirrored = (

@@ -123,9 +123,8 @@ def with_more_critics(
     """
     check_step_by_step(settings)
     source = fine_tuned_sac(source_model, target, seed, device)
+    check_critics(source, n_critics)
     old = source.critic.q_networks
-    if n_critics < len(old):
-        raise ValueError(f"n_critics must be at least the source model's {len(old)}, got {n_critics}")
     arguments = {**warm.carried_arguments(source), "learning_starts": 0, "seed": seed, "device": device, **settings}
     arguments["policy_kwargs"] = {**arguments["policy_kwargs"], "n_critics": n_critics}
     model = SAC("MlpPolicy", target, **arguments)
@@ -143,6 +142,16 @@ def with_more_critics(
         regress(network, th.optim.Adam(network.parameters(), lr=1e-3), inputs, goals, CRITIC_STEPS)
     model.critic_target.load_state_dict(model.critic.state_dict())
     return model
+
+
+def check_critics(source: SAC, n_critics: int) -> None:
+    """Refuse a number of critics that does not begin with the source model's own.
+
+    :raises ValueError: with the remedy
+    """
+    old = len(source.critic.q_networks)
+    if not isinstance(n_critics, int) or n_critics < old:
+        raise ValueError(f"n_critics must be an integer, at least the source model's {old}, got {n_critics!r}")
 
 
 # ---------------------------------------------------------------------- mixed buffers
@@ -208,6 +217,23 @@ def rollout_length(budget: int, longest: int) -> int:
     return max((n for n in range(2, min(longest, budget) + 1) if budget % n == 0), default=budget)
 
 
+def trpo_steps(budget: int, n_steps: int | None) -> int:
+    """Steps of each of TRPO's rollouts.
+
+    :param budget: target steps
+    :param n_steps: those that are asked for; None: 2048, for small budgets a quarter
+    :raises ValueError: for what is no divisor of the budget above 1: TRPO would overspend it
+    """
+    if n_steps is None:
+        return rollout_length(budget, min(2048, max(budget // 4, 2)))
+    if not isinstance(n_steps, int) or n_steps < 2 or budget % n_steps:
+        raise ValueError(
+            f"n_steps={n_steps!r} must be an integer above 1 that divides the budget of {budget} target steps, or TRPO "
+            "overspends it"
+        )
+    return n_steps
+
+
 def cloned_trpo(
     source_model: str | pathlib.Path,
     target: gym.Env,
@@ -231,9 +257,7 @@ def cloned_trpo(
     from sb3_contrib import TRPO  # an extra
 
     teacher = SAC.load(source_model, device=device)
-    n_steps = settings.pop("n_steps", None) or rollout_length(budget, min(2048, max(budget // 4, 2)))
-    if budget % n_steps:
-        raise ValueError(f"n_steps={n_steps} must divide the budget of {budget} target steps, or TRPO overspends it")
+    n_steps = trpo_steps(budget, settings.pop("n_steps", None))
     defaults = {
         "gamma": teacher.gamma,
         "batch_size": rollout_length(n_steps, 128),

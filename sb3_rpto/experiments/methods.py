@@ -106,6 +106,7 @@ def _sac_warm_high(run: Run, curve: LearningCurve) -> None:
     if n_critics is None:
         model = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, **settings)
     else:
+        baselines.check_critics(SAC.load(run.source_model, device="cpu"), n_critics)
         data = run.source_transitions(curve)
         model = baselines.with_more_critics(
             run.source_model, run.make_target(), run.seed, n_critics, data, run.device, **settings
@@ -120,6 +121,7 @@ def _sac_mixed(run: Run, curve: LearningCurve) -> None:
 
 
 def _trpo_warm(run: Run, curve: LearningCurve) -> None:
+    baselines.trpo_steps(run.budget, run.kwargs.get("n_steps"))
     states = run.source_transitions(curve)["observations"]
     model = baselines.cloned_trpo(
         run.source_model, run.make_target(), run.seed, run.budget, states, run.device, **run.kwargs

@@ -220,9 +220,24 @@ def test_a_trpo_rollout_divides_the_budget() -> None:
     assert baselines.rollout_length(100_000, 2048) == 2000
 
 
-def test_a_budget_that_trpo_would_overspend_is_refused(source_model: str) -> None:
-    with pytest.raises(ValueError, match="n_steps=50 must divide"):
-        run("trpo-warm", source_model, n_steps=50)
+@pytest.mark.parametrize(
+    ("method", "wrong", "said"),
+    [
+        ("trpo-warm", {"n_steps": 50}, "n_steps=50 must be an integer above 1 that divides"),
+        ("trpo-warm", {"n_steps": 0}, "n_steps=0 must be"),
+        ("trpo-warm", {"n_steps": "ten"}, "n_steps='ten' must be"),
+        ("sac-warm-high", {"n_critics": 1}, "n_critics must be .* at least the source model's 2, got 1"),
+        ("sac-warm-high", {"n_critics": "ten"}, "n_critics must be an integer"),
+    ],
+)
+def test_what_a_method_cannot_do_costs_no_source_step(
+    method: str, wrong: dict, said: str, source_model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spent: list[Any] = []
+    monkeypatch.setattr(baselines, "source_transitions", lambda *args: spent.append(args))
+    with pytest.raises(ValueError, match=said):
+        run(method, source_model, **wrong)
+    assert not spent
 
 
 def test_trpo_warm_starts_as_the_sac(source_model: str) -> None:
