@@ -75,6 +75,8 @@ class DualReplayBuffer(ReplayBuffer):
         self.target_added = 0
         #: whether the target side is a robot's log that was traced, whose states are estimates
         self.estimated = False
+        #: whether rewards of the target side are zeros that stand for unknown ones
+        self.unrewarded = False
         #: observations of the real source environment, from which model branches may start; (n, observation_dim)
         self.source_starts = np.empty((0, *observation_space.shape), dtype=observation_space.dtype)
         # BaseBuffer alone: ReplayBuffer's constructor would allocate a third set of arrays.
@@ -128,7 +130,7 @@ class DualReplayBuffer(ReplayBuffer):
         """Forget the target side: to SB3 it is the replay buffer."""
         self.target.reset()
         self.target_added = 0
-        self.estimated = False
+        self.estimated = self.unrewarded = False
 
     def add(
         self,

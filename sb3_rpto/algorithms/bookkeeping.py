@@ -136,7 +136,7 @@ class TwoWorlds(PolicySnapshots):
             for earned in (self.ep_info_buffer, self.ep_success_buffer):
                 if earned is not None:
                     earned.clear()
-            self._owed = 0
+            self._owed = self._since_fit = 0
             if self.loop is not None:
                 self.loop.forget_target()
             self._drop_target_data()

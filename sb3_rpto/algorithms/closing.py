@@ -100,8 +100,8 @@ class LoopCloser:
 
     @property
     def traced(self) -> bool:
-        """Whether this target was traced, or a trace of it was tried and told that it could not be."""
-        return self._traced_at is not None
+        """Whether this target was traced, a trace of it told that it could not be, or none is to be."""
+        return self.kinds is False or self._traced_at is not None
 
     def due(self, model: Looping, dynamics: PhysicalDynamics) -> bool:
         """Whether enough was seen for a first trace, for a better one than the last, or is no longer predicted."""
@@ -125,7 +125,7 @@ class LoopCloser:
         """How many target steps the first trace still waits for; 0 or less where it is due or was made."""
         side = model.replay_buffer.target
         most = side.size() if model._offline else side.buffer_size  # recorded transitions become no more
-        return 0 if self._traced_at is not None else min(FIRST, most) - side.size()
+        return 0 if self.traced else min(FIRST, most) - side.size()
 
     def close(self, model: Looping, dynamics: PhysicalDynamics) -> None:
         """Trace on D_target, keep what lowers the error, log it, and renew D_source where another simulator made it.
@@ -282,7 +282,7 @@ class LoopCloser:
             self.declared,
             known=[from_json(stored) for stored in model.dynamics_kwargs.get("effects", ())],
             seed=model.seed or 0,
-            candidates=None if isinstance(self.kinds, bool) else self.kinds,
+            candidates=None if self.kinds is True else self.kinds or [],
             horizon=horizon,
             threads=dynamics.threads,
             progress=self.progress,

@@ -63,7 +63,7 @@ class Looping(Resumable):
         return self.loop is not None and self.loop.keeps_phi
 
     def _close_the_loop(self) -> None:
-        if self.loop is not None and self.close_loop is not False:
+        if self.loop is not None and self.loop.kinds is not False:
             assert isinstance(self.dynamics, PhysicalDynamics)  # checked by the constructor
             if self.loop.due(self, self.dynamics):
                 self.loop.close(self, self.dynamics)

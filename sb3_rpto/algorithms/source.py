@@ -137,6 +137,8 @@ class EpisodeSource(SourceWorld):
             model.replay_buffer.append("source", raw_obs, raw_next, scaled, rewards, dones, timeouts, infos)
             for i in np.flatnonzero(dones):
                 self._episode_ended(int(i))
+            if dones.any() and _draws_by_episode(model):
+                held = math.inf
             for info in infos:
                 if "episode" in info:
                     self.returns.append(info["episode"]["r"])
@@ -319,7 +321,12 @@ def sample_policy(model: RelativeUpdate, observations: th.Tensor) -> th.Tensor:
 
 def _sde_hold(model: RelativeUpdate) -> float:
     """For how many steps gSDE's noise is held, as in the target: SB3 draws anew with each rollout, or more often."""
-    rollout = model.train_freq
-    assert isinstance(rollout, TrainFreq)  # an int until SB3's _setup_model
-    held = rollout.frequency if rollout.unit == TrainFrequencyUnit.STEP else math.inf
+    assert isinstance(model.train_freq, TrainFreq)  # an int until SB3's _setup_model
+    held = math.inf if _draws_by_episode(model) else model.train_freq.frequency
     return min(held, model.sde_sample_freq if model.sde_sample_freq > 0 else math.inf)
+
+
+def _draws_by_episode(model: RelativeUpdate) -> bool:
+    """Whether a rollout, and with it gSDE's noise, lasts for episodes."""
+    assert isinstance(model.train_freq, TrainFreq)  # as above
+    return model.train_freq.unit == TrainFrequencyUnit.EPISODE

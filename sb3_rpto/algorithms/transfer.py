@@ -234,7 +234,7 @@ class TransferAlgorithm(Looping):
                 self.set_target_env(target_env)
             if self.measured is not None and isinstance(self.dynamics, PhysicalDynamics):
                 self._traces_log = True
-                self.loop = self.loop or LoopCloser(self.declared, kinds=[])
+                self.loop = self.loop or LoopCloser(self.declared, kinds=False)
             if target_data is not None:
                 warm.fill_target(self, target_data)
                 self._since_fit = self.model_train_freq  # all data are there: the first fit need not wait
@@ -374,7 +374,7 @@ class TransferAlgorithm(Looping):
             if not self.interact_with_target(callback, log_interval):  # step 4
                 break
             self.update()  # steps 5 and 6
-        if self.loop is not None and self._steps_left() <= 0:
+        if self.loop is not None and (self._offline or self._steps_left() <= 0):
             self.loop.finish(self)
         callback.on_training_end()
         self._callback = None

@@ -237,10 +237,11 @@ class RelativeUpdate(SAC):
     def critic_batches(self, count: int, batch_size: int) -> Iterator[ReplayBufferSamples]:
         """Batches of D_source with their share ``real_ratio`` of D_target.
 
-        Of D_source alone while pretraining, and where D_target is a robot's log that the simulator accounts for: the
-        states of a log are estimates, without what has yet to act, and the simulator knows better.
+        Of D_source alone while pretraining, where rewards of D_target are not known, and where it is a robot's log that
+        the simulator accounts for: the states of a log are estimates, without what has yet to act, and the simulator
+        knows better.
         """
-        needless = self._traces_log and self._worlds_are_alike()
+        needless = self.replay_buffer.unrewarded or (self._traces_log and self._worlds_are_alike())
         real = not self._pretraining and not needless and self.replay_buffer.target.size() > 0
         n_target = min(round(self.real_ratio * batch_size), batch_size - 1) if real else 0
         drawn = self._draw("source", count, batch_size - n_target)

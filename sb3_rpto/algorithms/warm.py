@@ -307,7 +307,7 @@ def _checked(arrays: dict[str, np.ndarray], model: Resumable, name: str) -> dict
 def _with_rewards(model: Resumable, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Recorded transitions with rewards: their own, those of a known rule, or zeros where nothing is to read them.
 
-    A share of target transitions in the critic's batches that nobody asked for is left out then.
+    A share of target transitions in the critic's batches that nobody asked for is left out as long as these are there.
 
     :raises ValueError: there are none, and something needs them
     """
@@ -322,14 +322,13 @@ def _with_rewards(model: Resumable, arrays: dict[str, np.ndarray]) -> dict[str, 
     need = _need_of_rewards(model)
     if need:
         raise ValueError(f"target_data holds no rewards, and the task's are not known: {need}")
-    if model.real_ratio > 0:
-        model.real_ratio = 0.0
-        if model.updates_policy and not model._traces_log:  # whose transitions the critic does not see
-            warnings.warn(
-                "target_data holds no rewards, and the task's are not known: real_ratio is 0 from here on, the critic "
-                "learns from the source's transitions alone",
-                stacklevel=5,
-            )
+    model.replay_buffer.unrewarded = True
+    if model.real_ratio > 0 and model.updates_policy and not model._traces_log:  # where the critic needs none
+        warnings.warn(
+            "target_data holds no rewards, and the task's are not known: the critic learns from the source's "
+            f"transitions alone, without the share real_ratio={model.real_ratio} of the target's",
+            stacklevel=5,
+        )
     return {**arrays, "rewards": np.zeros(len(arrays["actions"]))}
 
 

@@ -124,7 +124,8 @@ class TargetLedger(VecEnvWrapper):
     def step_wait(self) -> Any:
         """The target's answer, unchanged."""
         answer = self.venv.step_wait()
-        self.unstored, self._left_at = True, whereabouts(self.venv)  # not before: the step may be interrupted
+        # Not before: the step may be interrupted. A step of somebody else's is none of D_target's.
+        self.unstored, self._left_at = self._allowance is not None, whereabouts(self.venv)
         self._stepping = False
         return answer
 

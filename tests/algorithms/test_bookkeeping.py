@@ -175,6 +175,65 @@ def test_a_step_of_the_target_that_was_interrupted_is_no_somebody_elses():
     assert_moves_as_a_pendulum(chronological(model.replay_buffer.target))
 
 
+def stop_at(model, steps):
+    """Ctrl-C in the update after so many target steps, each of which is stored by then."""
+    update = model.update
+
+    def interrupted():
+        if model.num_timesteps == steps:
+            raise KeyboardInterrupt
+        update()
+
+    model.update = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(100, source_timesteps=0)
+    del model.update
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_steps_that_a_script_takes_after_an_interruption_make_up_no_transition(other):
+    model = small(RPO, short(10.0), short())
+    stop_at(model, 20)
+    if other:
+        with pytest.warns(UserWarning, match="D_target loses"):
+            model.set_target_env(short(14.0))
+    model.target_env.reset()
+    for _ in range(3):
+        model.target_env.step(np.zeros((1, 1)))
+    model.learn(3, reset_num_timesteps=False, source_timesteps=0)
+    assert model.num_timesteps == 23
+    assert model.replay_buffer.target.size() == (3 if other else 23)
+    assert_moves_as_a_pendulum(chronological(model.replay_buffer.target))
+
+
+def test_steps_that_a_script_takes_after_a_callback_failed_make_up_no_transition():
+    class Fails(BaseCallback):
+        def _on_training_start(self):
+            raise RuntimeError("mine")
+
+        def _on_step(self):
+            return True
+
+    model = small(RPO, short(10.0), short())
+    with pytest.raises(RuntimeError, match="mine"):
+        model.learn(10, callback=Fails(), source_timesteps=0)
+    model.target_env.reset()
+    model.target_env.step(np.zeros((1, 1)))
+    model.learn(10, source_timesteps=0)
+    assert model.replay_buffer.target.size() == 10
+
+
+def test_the_first_fit_to_another_target_waits_for_transitions_of_it():
+    model = small(RPTO, short(10.0), short(), model_train_freq=20)
+    model.learn(19, source_timesteps=0)
+    with pytest.warns(UserWarning, match="D_target loses"):
+        model.set_target_env(short(14.0))
+    seen, fit = [], model.dynamics.fit
+    model.dynamics.fit = lambda data, *rest: seen.append(len(data)) or fit(data, *rest)
+    model.learn(25, reset_num_timesteps=False)
+    assert seen == [20]
+
+
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_a_source_phase_that_goes_on_begins_a_new_episode(n_envs):
     source = DummyVecEnv(

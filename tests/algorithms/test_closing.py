@@ -1291,6 +1291,33 @@ def test_after_a_log_the_best_policy_is_left_and_the_last_one_goes_on_learning(m
     np.testing.assert_array_equal(weights(made), last)
 
 
+def test_a_callback_that_stops_a_run_on_a_log_leaves_the_best_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
+    made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)
+    assert made.loop is not None
+    assert made.loop.accounts
+    finished: list[object] = []
+    monkeypatch.setattr(made.loop, "finish", finished.append)
+    made.learn(500, callback=lambda *_: made.num_timesteps < 200, reset_num_timesteps=False)
+    assert made.num_timesteps < 560
+    assert finished == [made]
+
+
+def test_a_target_after_a_log_is_not_traced_where_nobody_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
+    made = model([], target_data=measured, close_loop=False, model_train_freq=20).learn(40, source_timesteps=0)
+    with pytest.warns(UserWarning, match="D_target loses"):
+        made.set_target_env(target([]))
+    with pytest.warns(UserWarning, match="ends before the first fit of the dynamics, after 20"):
+        arguments.check_ready(made, 10, None)
+    judged: list[float] = []
+    monkeypatch.setattr("sb3_rpto.algorithms.bookkeeping.doubt", lambda _, error: judged.append(error))
+    made.learn(45)
+    assert len(judged) == 1
+    assert made.loop is not None
+    assert len(made.loop.found) == 1  # that of the log
+
+
 def test_the_first_policy_to_be_beaten_is_that_of_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
     made = forgetful()
     scripted(made, monkeypatch, 50.0, 30.0)

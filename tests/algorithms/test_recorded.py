@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from conftest import SMALL_ENSEMBLE, SMALL_POLICY
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPTO, RTO
@@ -240,11 +241,23 @@ def test_unknown_rewards_are_not_made_up() -> None:
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*real_ratio")  # of a log that is traced the critic sees nothing
         made = model(log(), env=env)
-    assert made.real_ratio == 0.0
     assert not chronological(made.replay_buffer.target)["rewards"].any()
-    with pytest.warns(UserWarning, match="real_ratio is 0 from here on"):
-        made = model(log(), env=env, dynamics="residual", declared=["hinge.damping"], weighting=None)
-    assert made.real_ratio == 0.0
+    with pytest.warns(UserWarning, match="without the share real_ratio="):
+        other = model(log(), env=env, dynamics="residual", declared=["hinge.damping"], weighting=None)
+    for one in (made, other):
+        one.real_ratio = 0.5  # which the target that comes after the log has use for
+        one.replay_buffer.append("source", **tens(one.replay_buffer.target))
+        assert (next(one.critic_batches(1, 16)).rewards == 10).all()
+    with pytest.warns(UserWarning, match="D_target loses"):
+        made.set_target_env(gym.wrappers.TransformReward(gym.make(TASK), lambda r: r))
+    made.replay_buffer.append("target", **{**tens(made.replay_buffer.source), "rewards": np.zeros(20)})
+    assert next(made.critic_batches(1, 16)).rewards.mean() == 5
+
+
+def tens(side: ReplayBuffer) -> dict[str, np.ndarray]:
+    """Twenty transitions of a side, each of which earned 10."""
+    rows = {name: values[:20] for name, values in chronological(side).items()}
+    return {"dones": rows.pop("terminations"), **rows, "rewards": np.full(20, 10.0)}
 
 
 def test_networks_are_not_taught_that_unknown_rewards_are_zero() -> None:

@@ -238,6 +238,15 @@ def test_exploration_noise_in_the_source_is_held_as_long_as_in_the_target(cls, t
     assert all(len(set(actions[i : i + held].tolist())) == 1 for i in range(0, 24, held))
 
 
+@ours
+def test_exploration_noise_in_the_source_lasts_an_episode_where_it_does_in_the_target(cls):
+    model = build(cls, gym.wrappers.TimeLimit(Still(), 6), Still(), use_sde=True, train_freq=(1, "episode"))
+    EpisodeSource(model.env).interact(model, 24)
+    actions = model.replay_buffer.source.actions[:24, 0, 0]
+    assert [len(set(actions[i : i + 6].tolist())) for i in range(0, 24, 6)] == [1, 1, 1, 1]
+    assert len(set(actions.tolist())) == 4
+
+
 @pytest.mark.parametrize("cls", [cls for cls in ALGORITHMS if cls.updates_dynamics])
 def test_every_branch_has_exploration_noise_of_its_own(cls):
     model = learn(build(cls, Still(), Still(), use_sde=True, source_steps=8, learning_starts=0), 5)
