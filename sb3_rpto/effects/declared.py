@@ -127,7 +127,7 @@ class Declared(Effect):
             self.dof = int(model.jnt_dofadr[self.index])
 
     def ceiling(self, scales: Scales) -> float:
-        """The largest value in a trace: without bounds, a joint's damping, friction and stiffness have one there.
+        """The largest value in a trace: where nobody bounds them, a joint's damping, friction and stiffness have one.
 
         It is ten times the nominal value, or what would hold the joint still against several times its torque. A fit
         to what something undeclared moves could freeze the joint, and with it all that might tell what that is.
@@ -135,9 +135,9 @@ class Declared(Effect):
         :param scales: of the joint
         """
         (parameter,) = self.parameters
-        if not self._how.holds:
+        if not self._how.holds or parameter.upper < np.inf:
             return parameter.upper
-        return min(parameter.upper, self.nominal + REACH * max(0.1 * self.nominal, self._how.size(scales)))
+        return self.nominal + REACH * max(0.1 * self.nominal, self._how.size(scales))
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Write the parameter's field."""

@@ -8,6 +8,9 @@ from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.names import SCALAR_JOINTS, hinges, object_names
 from sb3_rpto.effects.world import World, add
 
+#: Half of what is left between stops that meet, for one unit of their place: six digits, as MJCF has, tell them apart.
+GAP = 1e-5
+
 
 @register
 class TorqueRipple(Effect):
@@ -110,10 +113,12 @@ class EndStop(Effect):
         return [n for n in super().places(model) if model.jnt_limited[names.index(n)]]
 
     def write(self, world: World, x: np.ndarray) -> None:
-        """Move the limits; those that would cross meet half-way."""
+        """Move the limits; those that would cross meet half-way, but for the gap that an MJCF must leave."""
         limits = world.field("jnt_range")[:, self.index]
         limits += x
-        limits[:] = np.where(limits[:, :1] > limits[:, 1:], limits.mean(axis=1, keepdims=True), limits)
+        middle = limits.mean(axis=1, keepdims=True)
+        met = middle + GAP * np.maximum(1.0, np.abs(middle)) * [-1, 1]
+        limits[:] = np.where(limits[:, :1] > limits[:, 1:], met, limits)
 
 
 @register

@@ -56,6 +56,7 @@ def write_mjcf(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[str, dict[st
     spec = spec.copy()
     compiled = spec.compile()
     _tell_inertia(spec, compiled)
+    _tell_derived(spec, compiled)
     try:
         spec.compile()
         spec.copy_back(model)
@@ -103,6 +104,26 @@ def _tell_inertia(spec: mujoco.MjSpec, compiled: mujoco.MjModel) -> None:
         body.explicitinertial = True
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     spec.compiler.settotalmass = -1
+    spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
+
+
+def _tell_derived(spec: mujoco.MjSpec, compiled: mujoco.MjModel) -> None:
+    """State what MuJoCo derives from masses, lengths and limits as it compiled, so that it stays when these change."""
+    for joint in spec.joints:
+        if joint.springdamper.any():
+            i, dof = joint.id, compiled.jnt_dofadr[joint.id]
+            joint.stiffness = [compiled.jnt_stiffness[i], *compiled.jnt_stiffnesspoly[i]]
+            joint.damping = [compiled.dof_damping[dof], *compiled.dof_dampingpoly[dof]]
+            joint.springdamper = np.zeros(2)
+    for tendon in spec.tendons:
+        tendon.springlength = compiled.tendon_lengthspring[tendon.id]
+    for actuator in spec.actuators:
+        i = actuator.id
+        actuator.biasprm = compiled.actuator_biasprm[i]  # a dampratio is a positive number here
+        actuator.lengthrange = compiled.actuator_lengthrange[i]
+        if actuator.inheritrange:
+            actuator.ctrlrange, actuator.actrange = compiled.actuator_ctrlrange[i], compiled.actuator_actrange[i]
+            actuator.inheritrange = 0.0
 
 
 def _copy_some(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from sb3_rpto.effects import LIBRARY, Declared, Effect, Scales, Simulation
 from sb3_rpto.effects.library import candidates as all_candidates
 from sb3_rpto.effects.library import given
+from sb3_rpto.effects.mjcf import restore, rounded
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.effects.names import near
 from sb3_rpto.effects.trial import try_out
@@ -27,7 +28,7 @@ from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.search import Selectors
 from sb3_rpto.tracing.select import Selector
 from sb3_rpto.tracing.turns import settle_turns
-from sb3_rpto.tracing.windows import BLOCK, MEMORY, Windows, cut, discretised, noise_levels
+from sb3_rpto.tracing.windows import BLOCK, MEMORY, Windows, cut, discretised, noise_levels, step_for
 
 #: Most windows to fit, and to select on.
 TRAIN, SELECT = 40, 40
@@ -140,6 +141,7 @@ def prepare(
     data, turned = settle_turns(compiled, data)
     findings = [*data.findings, *turned, *check_against(compiled, data), *_own_step(model)]
     given(compiled, declared, known)  # what is wrong there is said before the work
+    roomy = with_room(spec, compiled, data)
     train, select, test = data.split(seed)
     findings += [f for f in train.findings if f not in findings]
     fitted = replace(data, episodes=train.episodes + select.episodes)
@@ -159,7 +161,7 @@ def prepare(
         message = f"{changes:.1f} a second come or go; windows of {length:.2g} s, as errors about a touch-down grow"
         findings.append(Finding("contacts", "fitted runs", message))
     # What was told need not be found out.
-    seems = "told" if data.simulated else origin(compiled, fitted, declared, sigma, length, threads, known)
+    seems = "told" if data.simulated else origin(roomy, fitted, declared, sigma, length, threads, known)
     if seems in ("simulated", "exact"):
         exact = seems == "exact"
         data, train, select, test, fitted = (
@@ -172,7 +174,7 @@ def prepare(
         findings.append(Finding("simulated", "fitted runs", message))
     touching &= not data.exact  # those are met, or fits begin anew until they are
     train, select, test, fitted = (replace(d, touching=touching) for d in (train, select, test, fitted))
-    nominal = discretised(compiled, fitted, fine=True)
+    nominal = discretised(roomy, fitted, fine=True)
     there = given(nominal, declared, known)
     if seems == "machine" and not data.exact:
         findings += soft_friction(nominal) + soft_ties(nominal)
@@ -189,9 +191,44 @@ def prepare(
     if (data.exact or data.simulated) and idle(fine, fitted, sigma):
         train, select, test, fitted = (replace(d, idle=True) for d in (train, select, test, fitted))
     scales = typical(fine, force_residuals(fine, fine.null, fitted)).scales(fine.effects)
-    rough = Simulation(discretised(compiled, fitted, fine=False), effects, threads)
+    rough = Simulation(discretised(roomy, fitted, fine=False), effects, threads)
     longer = _longer(rough.model, train, select, sigma, length) if horizon is None else None
     return SetUp(spec, compiled, findings, train, select, test, fitted, sigma, fine, rough, scales, length, longer)
+
+
+def with_room(spec: mujoco.MjSpec | None, compiled: mujoco.MjModel, data: Measurements) -> mujoco.MjModel:
+    """The model, whose delayed actuators hold as many commands as the shorter steps of measured data take.
+
+    MuJoCo keeps ``nsample`` of them, one for each step: in shorter ones as many span less than the delay.
+
+    :param spec: of the model; None where nothing tells it
+    :param compiled: the model
+    :param data: recordings
+    :raises ValueError: there is not enough room, and nothing tells the MJCF
+    """
+    if data.exact or data.simulated:
+        return compiled
+    step = step_for(compiled, data) / SHORTER
+    needed = np.ceil(compiled.actuator_delay / step - 1e-9).astype(int)
+    lacking = np.flatnonzero(needed > np.where(compiled.actuator_delay > 0, compiled.actuator_history[:, 0], needed))
+    if not len(lacking):
+        return compiled
+    if spec is None:
+        i = lacking[0]
+        raise ValueError(
+            f"actuator {compiled.actuator(i).name!r} is delayed by {compiled.actuator_delay[i]:g} s and holds "
+            f"nsample={compiled.actuator_history[i, 0]} commands; measured data are simulated in steps down to "
+            f'{step:.3g} s, which take nsample="{needed[i]}": write that in the MJCF'
+        )
+    spec = spec.copy()
+    for i in lacking:
+        spec.actuators[i].nsample = int(needed[i])
+    roomy = spec.compile()
+    others = rounded(roomy, compiled)
+    for name in ("actuator_history", "actuator_historyadr", "sensor_historyadr"):
+        others.pop(name, None)
+    restore(roomy, others)
+    return roomy
 
 
 def at_rest(data: Measurements) -> list[str]:

@@ -37,6 +37,7 @@ class ForceResidual:
     :param load: generalised force of the actuators as the model has it, N·m or N, (T, nv)
     :param command: (T, nu)
     :param force: needed by the motion less what the model has, N·m or N, (T, nv)
+    :param touches: whether geoms touch at any time
     """
 
     episode: str
@@ -46,6 +47,7 @@ class ForceResidual:
     load: np.ndarray
     command: np.ndarray
     force: np.ndarray
+    touches: bool = False
 
 
 def force_residuals(simulation: Simulation, values: np.ndarray, data: Measurements) -> list[ForceResidual]:
@@ -73,12 +75,14 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     settings = simulation.from_settings({name: np.array([value]) for name, value in e.params.items()})
     world = BatchWorld(simulation.model, 1, 1)
     prepare(world, [*settings, *active])
-    needed, load, known = _forces(world, pushing(active), qpos, qvel, commands, enabled, h)
+    needed, load, known, touches = _forces(world, pushing(active), qpos, qvel, commands, enabled, h)
     load, known = (np.stack([low(column) for column in forces.T], axis=1) for forces in (load, known))
     force = needed - load - known
     edge = 1 if data.whole_states else min(round(EDGE / (_cutoff(h) * h)), len(time) // 4)
-    arrays = (a[edge : len(time) - edge] for a in (time - time[0], shown, qvel, load, commands, force))
-    return ForceResidual(e.name, *arrays)
+    time, shown, qvel, load, commands, force = (
+        a[edge : len(time) - edge] for a in (time - time[0], shown, qvel, load, commands, force)
+    )
+    return ForceResidual(e.name, time, shown, qvel, load, commands, force, touches)
 
 
 def _motion(
@@ -129,8 +133,8 @@ def _forces(
     commands: np.ndarray,
     enabled: np.ndarray,
     h: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Generalised forces, (T, nv) each: needed by the motion, of the actuators, and of effects and friction.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+    """Generalised forces, (T, nv) each: needed by the motion, of the actuators, of effects and friction; any touch.
 
     :param world: one world, its model prepared; dry friction and joint limits are taken out of it
     :param acting: effects that push
@@ -149,6 +153,7 @@ def _forces(
     substeps = max(1, round(h / model.opt.timestep)) if model.na or model.nhistory else 0
     switch = Switch(LiveWorld(model, mj), None if enabled.all() else enabled[None])
     needed, load, known = (np.zeros_like(qvel) for _ in range(3))
+    touches = False
     for t in range(len(qvel)):
         switch(t)
         mj.qpos[:], mj.qvel[:], mj.ctrl[:] = qpos[t], qvel[t], around[t]
@@ -160,6 +165,7 @@ def _forces(
         mj.qpos[:], mj.qvel[:], mj.qacc[:] = qpos[t], qvel[t], qacc[t]
         mujoco.mj_inverse(model, mj)
         needed[t] = mj.qfrc_inverse
+        touches |= bool((mj.contact.dist < 0).any())
         level = friction.copy()
         if acting:
             world.qpos[:], world.qvel[:] = qpos[t], qvel[t]
@@ -170,7 +176,7 @@ def _forces(
                 mujoco.mj_applyFT(model, mj, world.pull[0, body], np.zeros(3), mj.xipos[body], int(body), known[t])
             level = level + world.friction[0]
         known[t] -= level * np.sign(qvel[t])
-    return needed, load, known
+    return needed, load, known, touches
 
 
 def _undo_sensor(effect: Effect, x: np.ndarray, time: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
@@ -248,9 +254,10 @@ def typical(simulation: Simulation, residuals: list[ForceResidual]) -> Typical:
         return np.maximum(np.quantile(np.abs(values), 0.95, axis=0), 1e-9)
 
     load, needed = high(rows["load"]), high(rows["load"] + rows["force"])
+    touches = any(r.touches for r in residuals)
     return Typical(
-        # Feet on the ground need forces that no motor gives: what acts at a driven joint is measured by its motor.
-        torque=np.where(load > 1e-6, np.minimum(needed, 2 * load), needed),
+        # Feet on the ground need forces that no motor gives: what acts at a driven joint is measured by its motor then.
+        torque=np.where(touches & (load > 1e-6), np.minimum(needed, 2 * load), needed),
         velocity=high(rows["qvel"]),
         inertia=np.maximum(np.diag(full), 1e-9),
         span=np.maximum(np.ptp(rows["qpos"], axis=0), 1e-3),

@@ -139,8 +139,7 @@ def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco
     """
     copy = model.__copy__()
     if not (data.exact or data.simulated):
-        longest = min(LONGEST, data.step)
-        copy.opt.timestep = model.opt.timestep / math.ceil(model.opt.timestep / longest - 1e-9)
+        copy.opt.timestep = step_for(model, data)
         if fine and stiff(copy):
             copy.opt.integrator = int(_IMPLICIT.get(model.opt.integrator, _FAST))
         elif fine:
@@ -149,6 +148,12 @@ def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco
             exact = copy.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
             copy.actuator_dyntype[exact] = int(mujoco.mjtDyn.mjDYN_FILTER)
     return copy
+
+
+def step_for(model: mujoco.MjModel, data: Measurements) -> float:
+    """The time step in s that measured data are simulated with: the model's own, or a whole part of it."""
+    longest = min(LONGEST, data.step)
+    return float(model.opt.timestep / math.ceil(model.opt.timestep / longest - 1e-9))
 
 
 _FAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST

@@ -13,7 +13,7 @@ from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales
 from sb3_rpto.effects.bodies import LinkLength
 from sb3_rpto.effects.carry import carried_by, correct, load_corrected, save_corrected
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
-from sb3_rpto.effects.model import load_model, numbers
+from sb3_rpto.effects.model import differing, load_model, numbers
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.corrected import apply_effects
@@ -190,6 +190,43 @@ def test_the_mjcf_alone_is_the_corrected_model_up_to_its_digits(tmp_path):
         if not name.startswith("stat."):
             np.testing.assert_allclose(value, exact[name], rtol=2e-5, atol=2e-5, err_msg=name)
     assert plain.dof_frictionloss[1] == pytest.approx(0.1 / 3, rel=1e-5)
+
+
+DERIVED = {
+    "dampratio": ("", 'name="servo" joint="knee" kp="10" dampratio="1"', "payload(c)"),
+    "inheritrange": ("", 'name="servo" joint="knee" kp="10" inheritrange="1"', "end_stop(knee)"),
+    "stops that meet": ("", 'name="servo" joint="knee" kp="10"', "end_stop(knee), crossing"),
+    "springdamper": ('springdamper="0.1 1"', "", "b.mass"),
+    "boundmass": ("", "", "c.mass"),
+    "springlength": ("", "", "link_length(b)"),
+    "springlength of a spring": ("", "", "spring(hip)"),
+}
+
+
+@pytest.mark.parametrize("what", DERIVED)
+def test_what_mujoco_derives_stays_as_it_was_derived_for_the_nominal_model(what, tmp_path):
+    joint, servo, changed = DERIVED[what]
+    joints = f"""<joint name="hip" axis="0 1 0" {joint}/>""", '<joint name="knee" axis="0 1 0" range="-1 1"/>'
+    xml = f"""<mujoco><compiler angle="radian" boundmass="0.1"/><worldbody><site name="wall" pos=".3 0 0"/>
+      <body name="b">{joints[0]}<geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5"/><site name="end" pos="0 0 -.5"/>
+      <body name="c" pos="0 0 -.5">{joints[1]}<geom type="capsule" size=".02" fromto="0 0 0 0 0 -.3"/></body></body>
+      </worldbody><tendon><spatial stiffness="200"><site site="wall"/><site site="end"/></spatial></tendon>
+      <actuator>{f"<position {servo}/>" if servo else ""}<motor name="motor" joint="hip"/></actuator></mujoco>"""
+    (tmp_path / "machine.xml").write_text(xml)
+    nominal = mujoco.MjModel.from_xml_string(xml)
+    effect = {
+        "payload(c)": lambda: LIBRARY["payload"]("c", mass=0.5),
+        "end_stop(knee)": lambda: LIBRARY["end_stop"]("knee", lower=0.2, upper=-0.2),
+        "end_stop(knee), crossing": lambda: LIBRARY["end_stop"]("knee", lower=1.2, upper=-1.3),
+        "b.mass": lambda: declare(nominal, ["b.mass"])[0].with_values(np.array([2.0])),
+        "c.mass": lambda: declare(nominal, ["c.mass"])[0].with_values(np.array([0.05])),
+        "link_length(b)": lambda: LIBRARY["link_length"]("b", change=0.2),
+        "spring(hip)": lambda: LIBRARY["spring"]("hip", stiffness=1.0, reference=0.5),
+    }[changed]()
+    save_corrected(tmp_path / "saved", tmp_path / "machine.xml", [effect])
+    plain, exact = mujoco.MjModel.from_xml_path(str(tmp_path / "saved/model.xml")), load_corrected(tmp_path / "saved")
+    assert differing(plain, exact.model, rounded=True) == []
+    assert differing(nominal, exact.model, rounded=True) != []
 
 
 def test_the_json_says_what_carries_an_effect(tmp_path):

@@ -111,6 +111,8 @@ def test_what_holds_a_joint_still_has_a_ceiling_in_a_trace() -> None:
     assert found[3:] == [np.inf, 0.7]
     (strong,) = declare(MODEL, ["hinge.damping"])
     assert strong.ceiling(Scales(torque=1e-6)) == pytest.approx(11 * strong.nominal)
+    (told,) = declare(MODEL, ["hinge.damping=0:40"])
+    assert told.ceiling(scales) == told.ceiling(Scales(torque=1e-6)) == 40
 
 
 @pytest.mark.parametrize(

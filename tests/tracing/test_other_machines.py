@@ -110,9 +110,10 @@ def test_an_actuators_own_filter_is_led_through_the_commands_before_a_window(dyn
 
 
 @pytest.mark.slow
-def test_an_actuators_own_delay_is_led_too() -> None:
-    xml = machine('<motor name="motor" joint="hinge" delay="0.04" nsample="402"/>')
-    data = steps(xml)
+@pytest.mark.parametrize("nsample", [402, 20])
+def test_an_actuators_own_delay_is_led_too(nsample: int) -> None:
+    data = steps(machine('<motor name="motor" joint="hinge" delay="0.04" nsample="402"/>'))
+    xml = machine(f'<motor name="motor" joint="hinge" delay="0.04" nsample="{nsample}"/>')
     told = briefly(xml, data, ["hinge.damping"], candidates=[])
     untold = briefly(machine(MOTOR), data, ["hinge.damping"], candidates=[])
     assert told.adequacy_before.ratio < 1.2

@@ -188,6 +188,23 @@ def test_typical_magnitudes_are_those_of_the_motion() -> None:
     assert np.all(found.torque > 0)
 
 
+@pytest.mark.parametrize("floor", [False, True])
+def test_a_motor_that_hardly_acts_measures_forces_on_the_ground_alone(floor: bool) -> None:
+    ground = '<geom type="plane" size="9 9 1" pos="0 0 -.42"/>' if floor else ""
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.001"/><worldbody>{ground}<body>
+        <joint name="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.4" size=".03" mass=".5"/>
+        </body></worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>""")
+    true = model.__copy__()
+    true.dof_damping[0], true.geom_contype[:], true.geom_conaffinity[:] = 0.3, 0, 0  # the floor is the model's alone
+    simulation, push = Simulation(true, [], 1), 0.002 * np.sin(np.arange(3000) / 90)[None, :, None]
+    q, v = simulation.rollout(np.empty((1, 0)), np.array([[2.0]]), np.zeros((1, 1)), Drive(push))
+    columns = {"qpos.hinge": q[0, :-1:5, 0], "qvel.hinge": v[0, :-1:5, 0], "ctrl.motor": push[0, ::5, 0]}
+    data = Measurements.from_tables({"run": {"time": 0.005 * np.arange(600), **columns}})
+    found = typical(Simulation(model, [], 1), force_residuals(Simulation(model, [], 1), np.empty(0), data))
+    needed = 0.3 * found.velocity[0]
+    assert found.torque[0] == pytest.approx(0.004 if floor else needed, rel=0.1)
+
+
 # --- what is learnable ------------------------------------------------------------------------------------------------
 
 
