@@ -115,13 +115,21 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
         )
     model = correct(nominal, effects)
     text, assets = write_mjcf(spec, model)
+    plain = mujoco.MjModel.from_xml_string(text, assets)
+    lost = differing(plain, model, rounded=True) if same_layout(plain, model) else []
+    if lost:
+        warnings.warn(
+            f"model.xml alone differs from the corrected model in {', '.join(lost)}, which its MJCF cannot say; "
+            "load_corrected() tells them from effects.json: do not load the file by itself",
+            stacklevel=2,
+        )
     stored = {
         "format": FORMAT,
         "mujoco": mujoco.__version__,
         "model": {"file": "model.xml", "sha256": hashlib.sha256(text.encode()).hexdigest()},
         "effects": [_describe(effect, nominal) for effect in own(effects, nominal)],
         "heights": nominal_heights(nominal),
-        "exact": rounded(mujoco.MjModel.from_xml_string(text, assets), model),
+        "exact": rounded(plain, model),
     }
     folder = Path(folder)
     (folder / "assets" if assets else folder).mkdir(parents=True, exist_ok=True)

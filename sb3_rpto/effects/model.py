@@ -19,6 +19,13 @@ ModelSource: TypeAlias = (
     str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | gym.Env | tuple[mujoco.MjSpec, mujoco.MjModel]
 )
 
+_SHAPES = mujoco.mjtGeom
+#: How many of its three sizes a shape has; one that is not here has all.
+_SIZES = {
+    **{int(_SHAPES.mjGEOM_SPHERE): 1, int(_SHAPES.mjGEOM_CAPSULE): 2, int(_SHAPES.mjGEOM_CYLINDER): 2},
+    **{int(_SHAPES.mjGEOM_HFIELD): 0, int(_SHAPES.mjGEOM_MESH): 0},  # those of what they show, which is compared
+}
+
 
 def load_model(source: ModelSource) -> tuple[mujoco.MjSpec | None, mujoco.MjModel]:
     """The compiled model that ``source`` holds, and the specification that it came from.
@@ -123,14 +130,23 @@ def numbers(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 def differing(one: mujoco.MjModel, other: mujoco.MjModel, rounded: bool = False) -> list[str]:
     """Names of the numbers in which two compiled models differ, those that follow from others left out.
 
-    :param rounded: but for the digits that an MJCF rounds off, and the statistics, which are of the model as compiled
+    :param rounded: but for the digits that an MJCF rounds off, the statistics, which are of the model as compiled, and
+        sizes that a shape does not have: an MJCF may hold any
     """
     derived = set(mujoco.MjModel._setconst_outputs) - set(mujoco.MjModel._setconst_inputs)
     mine, theirs = numbers(one), numbers(other)
     if rounded:
+        for model, held in ((one, mine), (other, theirs)):
+            held |= {f"{what}_size": _sizes(model, what) for what in ("geom", "site")}
         named = [n for n in mine if n not in derived and not n.startswith("stat.")]
         return [n for n in named if not np.allclose(mine[n], theirs[n], 1e-4, 1e-9, equal_nan=True)]
     return [n for n in mine if n not in derived and not np.array_equal(mine[n], theirs[n], equal_nan=True)]
+
+
+def _sizes(model: mujoco.MjModel, what: str) -> np.ndarray:
+    """Sizes of the geoms or sites, (n, 3), zero where their shape has none."""
+    count = np.array([_SIZES.get(int(shape), 3) for shape in getattr(model, f"{what}_type")], dtype=int)
+    return np.where(np.arange(3) < count[:, None], getattr(model, f"{what}_size"), 0.0)
 
 
 def sites_act(model: mujoco.MjModel) -> bool:

@@ -556,18 +556,26 @@ def test_bad_sources_are_named(tmp_path):
         save_corrected(tmp_path, mujoco.MjModel.from_xml_string(PLAIN), [])
 
 
-def test_effects_that_the_loaded_model_has_already_are_not_put_in_twice(tmp_path):
-    effects = [LIBRARY["coulomb_friction"]("hinge", level=0.5), LIBRARY["payload"]("pole", mass=1.0)]
-    effects.append(LIBRARY["command_delay"]("slide", delay=0.04))
-    env = gym.make("InvertedPendulum-v5")
+@pytest.mark.parametrize(
+    ("task", "joint", "body", "motor"),
+    [
+        ("InvertedPendulum", "hinge", "pole", "slide"),
+        ("InvertedDoublePendulum", "hinge2", "pole2", "slide"),  # whose site has a size too many
+        ("Pusher", "r_shoulder_pan_joint", "r_forearm_link", "actuator0"),  # and whose geoms have
+    ],
+)
+def test_effects_that_the_loaded_model_has_already_are_not_put_in_twice(task, joint, body, motor, tmp_path):
+    effects = [LIBRARY["coulomb_friction"](joint, level=0.5), LIBRARY["payload"](body, mass=1.0)]
+    effects.append(LIBRARY["command_delay"](motor, delay=0.04))
+    env = gym.make(f"{task}-v5")
     save_corrected(tmp_path, env, effects)
-    again = gym.make("InvertedPendulum-v5", xml_file=str(tmp_path / "model.xml"))
+    again = gym.make(f"{task}-v5", xml_file=str(tmp_path / "model.xml"))
     trajectories = []
     for start in (env, again):
         corrected = load_corrected(tmp_path).apply(start)
         corrected.reset(seed=0)
-        trajectories.append([corrected.step(np.array([0.3]))[0] for _ in range(5)])
-    np.testing.assert_allclose(*trajectories, rtol=1e-4, atol=1e-6)
+        trajectories.append([corrected.step(np.full(env.action_space.shape, 0.3))[0] for _ in range(5)])
+    np.testing.assert_allclose(*trajectories, rtol=1e-4, atol=1e-5)
 
 
 def test_without_an_environment_a_correction_is_simulated(tmp_path) -> None:
