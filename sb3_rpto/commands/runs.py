@@ -250,6 +250,11 @@ class SavedCurve(LearningCurve):
         if not isinstance(self.model, TransferAlgorithm):
             self._save()
 
+    def _on_training_end(self) -> None:
+        if self._due == self.total:
+            self._due = self.num_timesteps
+        super()._on_training_end()
+
     def _report(self, report: Report) -> None:
         """Write what a trace has found."""
         report.save(self.run.path)
@@ -259,6 +264,8 @@ class SavedCurve(LearningCurve):
             self.say(f"{self.num_timesteps:>9,} steps: {report.verdict}, {named} named; written: {page}")
 
     def _on_step(self) -> bool:
+        if self._due == self.total:  # a rollout that goes on beyond: its update comes first
+            return True
         super()._on_step()
         if isinstance(self.model, TransferAlgorithm):
             self._save()

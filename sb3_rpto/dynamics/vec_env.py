@@ -10,11 +10,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_rpto.dynamics.base import Dynamics
-from sb3_rpto.dynamics.env import check_dynamics, predict
+from sb3_rpto.dynamics.env import check_dynamics, predict, time_limit
 from sb3_rpto.envs.state import restore_state, save_state
 
 
@@ -168,6 +168,8 @@ class DynamicsVecEnv(VecEnv):
 
 
 def _time_limit(source: VecEnv) -> int | None:
+    if isinstance(source, DummyVecEnv):
+        return time_limit(source.envs[0])
     if source.has_attr("_max_episode_steps"):  # a TimeLimit wrapper's
         return source.get_attr("_max_episode_steps", indices=[0])[0]
     spec = source.get_attr("spec", indices=[0])[0]

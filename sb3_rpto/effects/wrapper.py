@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import mujoco
 import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.utils import EzPickle, RecordConstructorArgs
 
 from sb3_rpto.effects.declared import Declared
@@ -104,8 +105,9 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
 
         :param effects: with their values, those of declared parameters too: what is not among them is nominal again
         :raises ValueError: an effect on an object that is not in the model, or on sensors that are read elsewhere than
-            in ``_get_obs``; a gain of a sensor that a servo reads and effects beneath change, or the other way round;
-            other effects came on top of these; nothing is changed then
+            in ``_get_obs``; physics stepped by a method of the environment's own; a gain of a sensor that a servo reads
+            and effects beneath change, or the other way round; other effects came on top of these; nothing is changed
+            then
         """
         if self._covered:
             raise ValueError("other effects came on top of these; set those, or begin from an environment without")
@@ -121,6 +123,12 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
                     f"{', '.join(sensing)}: {type(base).__name__} has no _get_obs(); read its sensors there"
                 )
             self._require_whole_servos(mine)
+            hooked = [e.label for e, _ in active(mine) if any(map(e.overrides, ("act", "command", "late")))]
+            if hooked and getattr(type(base), _SEAMS[0], None) not in (None, MujocoEnv._step_mujoco_simulation):
+                raise ValueError(
+                    f"{', '.join(hooked)}: {type(base).__name__} has a {_SEAMS[0]}() of its own, in whose place these "
+                    "would act; override do_simulation() instead, and call super() in it"
+                )
         except Exception:
             prepare(self._world, active(self.effects))
             raise

@@ -111,6 +111,7 @@ class _View:
         self.understood = parts is not None
         self.wrappers = set(re.findall(r"\w+", parts[1])) if parts else set()
         self.id: str | None = parts[3] if parts else None
+        self.kind: str | None = parts[2] if parts else None
 
     @property
     def strange(self) -> set[str]:
@@ -192,7 +193,7 @@ def _known_task(view: _View) -> TaskRules:
 
 
 def _task_name(view: _View) -> str | None:
-    """The task's gymnasium name: by class for gymnasium's and our own environments, else by id."""
+    """The task's gymnasium name: by class for gymnasium's and our own environments, in a subprocess by id and name."""
     if view.env is not None:
         family = type(view.env.unwrapped).__mro__
         for i, cls in enumerate(family):
@@ -205,8 +206,11 @@ def _task_name(view: _View) -> str | None:
         if not family[0].__module__.startswith(("gymnasium.", "sb3_rpto.")):
             return None  # somebody's own task, whatever it is called
     # Ours may be targets: rpto/Hopper-gravity-x0.5-v0.
-    task = re.fullmatch(r"rpto/(\w+)(?:-[\w.-]+)?-v\d+", view.id or "") or re.fullmatch(r"(\w+)-v\d+", view.id or "")
-    return task[1] if task else None
+    ours = re.fullmatch(r"rpto/(\w+)(?:-[\w.-]+)?-v\d+", view.id or "")
+    task = ours or re.fullmatch(r"(\w+)-v\d+", view.id or "")
+    if task is None or (ours is None and view.kind not in (f"{task[1]}Env", "Continuous_MountainCarEnv")):
+        return None
+    return task[1]
 
 
 def _changes_task(heir: type, task: type) -> bool:

@@ -205,6 +205,18 @@ def test_the_last_return_is_that_of_the_model_that_is_written(method: str, agent
     assert evaluate(written, worlds, 2, seed=0) == rows(tmp_path)[-1]["return"]
 
 
+@pytest.mark.parametrize("train_freq", ["25", "[1, episode]"])
+def test_a_training_of_whole_rollouts_ends_with_the_return_of_its_model(train_freq: str, tmp_path: Path) -> None:
+    rollouts = ["--set", f"train_freq={train_freq}", "--set", "gradient_steps=20", "--set", "learning_rate=0.1"]
+    assert train(tmp_path, *rollouts) == 0
+    written = SAC.load(tmp_path / "model.zip", device="cpu")
+    last = rows(tmp_path)[-1]
+    assert last["steps"] == written.num_timesteps >= 60
+    assert last["updates"] == written._n_updates
+    worlds = make_vec_env(partial(gym.make, SOURCE), n_envs=2)
+    assert evaluate(written, worlds, 2, seed=0) == last["return"]
+
+
 @pytest.mark.slow
 def test_a_closed_loop_leaves_its_report_and_the_corrected_simulator(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

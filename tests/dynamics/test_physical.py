@@ -1,10 +1,12 @@
 """Simulators as trainable dynamics: what is fitted is what the target has, and step() is the environment's own."""
 
 import copy
+import importlib.util
 import io
 import pickle
 import warnings
 from contextlib import nullcontext
+from pathlib import Path
 
 import gymnasium as gym
 import mujoco
@@ -556,6 +558,26 @@ def test_a_step_is_the_corrected_environments_own(env_id, sensor):
     np.testing.assert_array_equal(said.terminations, data.terminations.bool())
     assert said.next_observations.dtype == data.observations.dtype
     np.testing.assert_array_equal(model.step(data.observations, data.actions).rewards, said.rewards)
+
+
+def test_a_reward_by_how_far_a_body_came_is_that_of_an_episode_under_way(tmp_path):
+    """Ant's is; Euler's method leaves bodies where they were before its last step."""
+    assets = Path(importlib.util.find_spec("gymnasium.envs.mujoco").submodule_search_locations[0]) / "assets"
+    (tmp_path / "ant.xml").write_text((assets / "ant.xml").read_text().replace("RK4", "Euler"))
+    kwargs = {"xml_file": str(tmp_path / "ant.xml"), "frame_skip": 2, "include_cfrc_ext_in_observation": False}
+    env = gym.make("Ant-v5", **kwargs)
+    spaces_of = env.observation_space, env.action_space
+    model = PhysicalDynamics(*spaces_of, **physical_config(env), declared=["torso.mass"], threads=1)
+    model.attach(env)
+    observation, _ = env.reset(seed=0)
+    env.action_space.seed(0)
+    for step in range(8):
+        action = env.action_space.sample()
+        before = th.as_tensor(observation)[None]
+        observation, reward, *_ = env.step(action)
+        if step:  # at a reset they are where they are
+            said = model.step(before, th.as_tensor(action)[None])
+            assert float(said.rewards[0]) == pytest.approx(reward, abs=1e-6)
 
 
 class Reaching(InvertedPendulumEnv):

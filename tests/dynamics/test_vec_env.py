@@ -226,6 +226,11 @@ def test_observations_are_raw_within_vec_normalize():
     assert source.obs_rms.mean[0] == 50.0
 
 
+def test_the_shortest_of_several_limits_ends_an_episode():
+    source = DummyVecEnv([lambda: gym.wrappers.TimeLimit(drift(), 1000)])
+    assert DynamicsVecEnv(DriftDynamics(), source, 2).max_episode_steps == 6
+
+
 def test_a_source_in_another_process():
     source = SubprocVecEnv([drift], start_method="fork")
     try:

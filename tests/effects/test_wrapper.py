@@ -588,6 +588,21 @@ def test_an_environment_that_goes_round_the_seam_is_found_out():
         wrapped.step(np.zeros(1))
 
 
+def test_physics_that_a_task_steps_by_itself_are_not_replaced_in_silence():
+    class Windy(type(gym.make(POLE).unwrapped)):
+        def _step_mujoco_simulation(self, ctrl, n_frames):
+            self.data.xfrc_applied[2, 0] = 5.0
+            super()._step_mujoco_simulation(ctrl, n_frames)
+
+    wrapped = CorrectedEnv(Windy(), [CoulombFriction("slider", level=0.4)])  # a number of the model
+    wrapped.reset(seed=0)
+    wrapped.step(np.zeros(1))
+    assert wrapped.unwrapped.data.xfrc_applied[2, 0] == 5.0
+    with pytest.raises(ValueError, match=r"test_clock\(hinge\): Windy has a _step_mujoco_simulation\(\) of its own"):
+        wrapped.set_effects([Clock("hinge", a=1.0)])
+    assert [effect.label for effect in wrapped.effects] == ["coulomb_friction(slider)"]
+
+
 def test_pickle_and_deepcopy_make_a_fresh_one_with_the_same_effects():
     env = gym.make(POLE)
     wrapped = CorrectedEnv(env, effects(env.unwrapped.model))

@@ -1,6 +1,7 @@
 """Rules against the real environments: every transition of random and of nearly failing rollouts."""
 
 import pickle
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -286,6 +287,9 @@ def test_somebodys_own_class_is_no_known_task_by_its_name():
         gym.register(name, entry_point=own, max_episode_steps=5)
         try:
             assert (task_rules(gym.make(name)).termination_fn is not None) == known
+            remote = SubprocVecEnv([partial(gym.make, name)], start_method="fork")
+            assert task_rules(remote).termination_fn is None
+            remote.close()
         finally:
             del gym.registry[name]
 
