@@ -46,6 +46,9 @@ class DualReplayBuffer(ReplayBuffer):
     :raises ValueError: for a ``target_size`` that is no positive integer
     """
 
+    #: whether rewards of the target side are zeros that stand for unknown ones; of the class, for buffers saved without
+    unrewarded = False
+
     def __init__(
         self,
         buffer_size: int,
@@ -75,8 +78,6 @@ class DualReplayBuffer(ReplayBuffer):
         self.target_added = 0
         #: whether the target side is a robot's log that was traced, whose states are estimates
         self.estimated = False
-        #: whether rewards of the target side are zeros that stand for unknown ones
-        self.unrewarded = False
         #: observations of the real source environment, from which model branches may start; (n, observation_dim)
         self.source_starts = np.empty((0, *observation_space.shape), dtype=observation_space.dtype)
         # BaseBuffer alone: ReplayBuffer's constructor would allocate a third set of arrays.
