@@ -23,6 +23,7 @@ from sb3_rpto.envs.rules import Rule, task_rules
 from sb3_rpto.tracing import Episode, Measurements
 from sb3_rpto.tracing.model_checks import check_clock, check_names
 from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, half_step, start_state, straight
+from sb3_rpto.tracing.turns import settle_turns
 from sb3_rpto.tracing.windows import command_order, held, noise_levels
 
 #: Observation wrappers whose answer depends on more than the observation.
@@ -87,6 +88,7 @@ def transitions(
         raise ValueError(f"{env} cannot be copied, which target_data=Measurements needs; give it one of gym.make")
     twin.reset(seed=0)
     base: Any = twin.unwrapped
+    measured, _ = settle_turns(base.model, measured)  # as the trace reads it, which says so
     log = _Log(measured, base.model, float(base.dt))
     # Sensors that err show the states as they were measured: the simulator is put where they truly were, but for the
     # joints of late ones, which the copy, as it has no past, shows as they are: where the log saw them.

@@ -7,8 +7,10 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.actuation import command_limits, drivers, servo_of
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.measurements import Measurements
 
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -16,13 +18,16 @@ _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 OTHER_UNITS = 10
 #: A position this far, in rad or m, beyond a joint's limits is said to be: limits give way a little.
 BEYOND = 0.1
+#: A servo that is, but for whole turns, this near to its command in half of the samples, in rad, holds it.
+HELD = 0.5
 
 
 def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurements, list[Finding]]:
-    """Shift angles by whole turns to where the model has limits or a spring: an encoder's zero tells no turns.
+    """Shift angles by whole turns to where the model has limits, a spring or a servo: an encoder's zero tells no turns.
 
     A hinge with limits is shifted where its angles lie outside them; one with a spring only where its angle was
-    unwrapped, for a spring may be wound up. Positions that stay outside their limits are said to.
+    unwrapped, for a spring may be wound up; any other that a servo holds where it never comes within half a turn of
+    its command. Positions that stay outside their limits are said to.
 
     :param model: of the machine
     :param data: recordings; not changed
@@ -43,13 +48,10 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
                 _check_radians(qpos[:, column], low, high, where)
             elif limited:
                 _check_metres(qpos[:, column], low, high, where)
-            middle = float(np.median(qpos[:, column]))
-            if model.jnt_type[joint] == _HINGE and ((not low <= middle <= high) or where in wrapped):
-                centre = (low + high) / 2 if limited else float(model.qpos_spring[model.jnt_qposadr[joint]])
-                turns = round((middle - centre) / (2 * np.pi)) if limited or model.jnt_stiffness[joint] else 0
+            if model.jnt_type[joint] == _HINGE:
+                turns, why = _turns_off(model, data, episode, joint, qpos[:, column], where in wrapped)
                 if turns:
                     qpos[:, column] -= 2 * np.pi * turns
-                    why = "limits" if limited else "spring"
                     found.append(Finding("whole turns", where, f"{turns:+d} turn(s) from the joint's {why}; taken off"))
             over = float(np.maximum(low - qpos[:, column], qpos[:, column] - high).max())
             if over > BEYOND and not (data.exact or data.simulated):
@@ -59,6 +61,38 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
                 found.append(Finding("outside limits", where, message))
         episodes.append(replace(episode, qpos=qpos))
     return replace(data, episodes=episodes), found
+
+
+def _turns_off(
+    model: mujoco.MjModel, data: Measurements, episode: Episode, joint: int, angles: np.ndarray, wrapped: bool
+) -> tuple[int, str]:
+    """By how many turns a hinge's angles, (T,) in rad, are off from the model's, and what tells it."""
+    middle = float(np.median(angles))
+    if model.jnt_limited[joint]:
+        low, high = model.jnt_range[joint]
+        inside = low <= middle <= high and not wrapped
+        return (0 if inside else round((middle - (low + high) / 2) / (2 * np.pi))), "limits"
+    if model.jnt_stiffness[joint]:
+        spring = float(model.qpos_spring[model.jnt_qposadr[joint]])
+        return (round((middle - spring) / (2 * np.pi)) if wrapped else 0), "spring"
+    off = angles - _commanded(model, data, episode, joint)
+    off = off[np.isfinite(off)]
+    turns = round(float(np.median(off)) / (2 * np.pi)) if len(off) else 0
+    # Not where a weak servo, or one under way, is far from its command by other than turns.
+    held = turns and np.abs(off).min() > np.pi and np.median(np.abs(off - 2 * np.pi * turns)) < HELD
+    return (turns if held else 0), "command"
+
+
+def _commanded(model: mujoco.MjModel, data: Measurements, episode: Episode, joint: int) -> np.ndarray:
+    """Angles, (T,) in rad, that a joint's one position servo is told to hold; NaN where it is off, or there is none."""
+    servos = [a for a in drivers(model, joint) if servo_of(model, a) == "position"]
+    names = [object_names(model, "actuator")[a] for a in servos]
+    if len(servos) != 1 or names[0] not in data.columns.ctrl:
+        return np.full(len(episode.time), np.nan)
+    low, high = command_limits(model)
+    column = data.columns.ctrl.index(names[0])
+    command = np.clip(episode.ctrl[:, column], low[servos[0]], high[servos[0]])
+    return np.where(episode.enabled[:, column] > 0, command / model.actuator_gear[servos[0], 0], np.nan)
 
 
 def _check_metres(positions: np.ndarray, low: float, high: float, where: str) -> None:

@@ -83,6 +83,15 @@ def model(measured: Measurements, cls: type = RPTO, env: gym.Env | None = None, 
 # --- D_target ---------------------------------------------------------------------------------------------------------
 
 
+def test_an_encoder_that_counts_from_another_turn_makes_the_same_transitions() -> None:
+    columns = {n: c for n, c in table().items() if n != "true"}
+    turned = Measurements.from_tables({"log": {**columns, "qpos.hinge": columns["qpos.hinge"] + 2 * np.pi}})
+    plain, found = transitions(log(), gym.make(TASK)), transitions(turned, gym.make(TASK))
+    assert len(found["actions"]) > 50
+    for name, column in plain.items():
+        np.testing.assert_allclose(found[name], column, atol=1e-6, err_msg=name)
+
+
 def test_transitions_of_a_simulator_come_back() -> None:
     env = gym.make(TASK)
     agent = SAC("MlpPolicy", env, learning_starts=120, seed=0, device="cpu").learn(120)

@@ -75,3 +75,39 @@ def test_a_joint_without_a_name_has_whole_turns_too() -> None:
     data, found = settle_turns(model, Measurements.from_tables({"run": column}))
     np.testing.assert_allclose(data.episodes[0].qpos[:, 0], ANGLE, atol=1e-12)
     assert [f.kind for f in found] == ["whole turns"]
+
+
+def servo(gear: float = 1.0) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody><body>
+        <joint name="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".03"/></body></worldbody>
+        <actuator><position name="servo" joint="hinge" kp="6" kv=".3" gear="{gear}"/></actuator></mujoco>""")
+
+
+def commanded(angle: np.ndarray, command: np.ndarray, **columns: np.ndarray) -> Measurements:
+    table = {"time": np.arange(len(angle)) * 0.01, "qpos.hinge": angle, "ctrl.servo": command, **columns}
+    return Measurements.from_tables({"run": table})
+
+
+@pytest.mark.parametrize("gear", [1.0, -2.0])
+@pytest.mark.parametrize("centre", [4.0, 14.0], ids=["wraps", "wraps twice away"])
+def test_what_a_servo_holds_comes_to_its_command(centre: float, gear: float) -> None:
+    angle = centre + 3 * ANGLE
+    encoder = np.mod(angle + np.pi, TURN) - np.pi
+    data, found = settle_turns(servo(gear), commanded(encoder, gear * (angle + 0.05)))
+    np.testing.assert_allclose(data.episodes[0].qpos[:, 0], angle, atol=1e-12)
+    assert [f.kind for f in found] == ["whole turns"]
+
+
+@pytest.mark.parametrize(
+    ("command", "columns"),
+    [
+        (np.linspace(0, 3 * TURN, 200), {}),
+        (ANGLE + TURN + 1.0, {}),
+        (ANGLE + TURN, {"enabled.servo": np.zeros(200)}),
+    ],
+    ids=["is under way", "is too weak", "is off"],
+)
+def test_a_servo_that_does_not_hold_tells_no_turns(command: np.ndarray, columns: dict[str, np.ndarray]) -> None:
+    data, found = settle_turns(servo(), commanded(ANGLE, command, **columns))
+    np.testing.assert_array_equal(data.episodes[0].qpos[:, 0], ANGLE)
+    assert found == []
