@@ -146,20 +146,23 @@ class DualReplayBuffer(ReplayBuffer):
         timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
         self.append("target", obs, next_obs, action, reward, done, timeouts, infos)
 
-    def resize_source(self, capacity: int) -> None:
-        """Give the source side another capacity; the newest transitions that fit are kept.
+    def resize(self, world: World, capacity: int) -> None:
+        """Give one side another capacity; the newest transitions that fit are kept.
 
         A class of the user's, which may keep what came in ``infos``, stays as large as it is once it holds some.
 
+        :param world: "source" or "target"
         :param capacity: in transitions
         """
-        foreign = type(self.source).add is not ReplayBuffer.add and self.source.size() > 0
-        if capacity == self.source.buffer_size or foreign:
+        side, added = self.side(world), self.target_added
+        foreign = type(side).add is not ReplayBuffer.add and side.size() > 0
+        if capacity == side.buffer_size or foreign:
             return
-        kept = {name: array[-capacity:] for name, array in chronological(self.source).items()}
-        self.source = self._make_side(buffer_size=capacity, device=self.device)
+        kept = {name: array[-capacity:] for name, array in chronological(side).items()}
+        setattr(self, world, self._make_side(buffer_size=capacity, device=self.device))
         if len(kept["rewards"]) > 0:
-            self.append("source", dones=kept.pop("terminations"), **kept)
+            self.append(world, dones=kept.pop("terminations"), **kept)
+        self.target_added, self.buffer_size = added, self.target.buffer_size
 
     def append(
         self,

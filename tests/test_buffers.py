@@ -113,11 +113,11 @@ def test_resizing_the_source_keeps_the_newest():
     buffer = DualReplayBuffer(8, OBS, ACT, device="cpu")
     buffer.append("source", **rows(0, 6))
     before = chronological(buffer.source)
-    buffer.resize_source(50)
+    buffer.resize("source", 50)
     for name, array in chronological(buffer.source).items():
         assert array.tolist() == before[name].tolist(), name
     buffer.append("source", **rows(6, 20))
-    buffer.resize_source(5)
+    buffer.resize("source", 5)
     assert chronological(buffer.source)["rewards"].tolist() == [21, 22, 23, 24, 25]
     assert buffer.source.buffer_size == 5
 
@@ -206,10 +206,10 @@ def test_a_buffer_class_of_the_users_sees_the_infos():
 def test_what_such_a_class_keeps_is_not_lost_by_a_new_capacity():
     space = spaces.Box(-1, 1, (2,))
     buffer = DualReplayBuffer(10, space, space, side_class=Costly)
-    buffer.resize_source(30)
+    buffer.resize("source", 30)
     rows = np.zeros((20, 2), dtype=np.float32)
     buffer.append("source", rows, rows, rows, *np.zeros((3, 20)), [{"cost": i} for i in range(20)])
-    buffer.resize_source(10)
+    buffer.resize("source", 10)
     assert (buffer.source.costs, buffer.source.size()) == (list(range(20)), 20)
 
 

@@ -334,7 +334,7 @@ def test_a_source_agent_brings_its_statistics_along(zoo, agent, tmp_path, place)
     shutil.copy(agent, tmp_path / "sac.zip")
     seen = VecNormalize(make_vec_env(SOURCE))
     seen.obs_rms.mean[:] = 7.0
-    path = tmp_path / place.format(source=SOURCE)
+    path = tmp_path / place.format(source=SOURCE.replace("/", "-"))  # as the zoo calls its folder
     path.parent.mkdir(parents=True, exist_ok=True)
     seen.save(str(path))
     manager = TransferManager.__new__(TransferManager)
@@ -346,6 +346,16 @@ def test_a_source_agent_brings_its_statistics_along(zoo, agent, tmp_path, place)
 def test_sac_that_was_trained_takes_no_random_steps_in_the_target(zoo, agent, tmp_path):
     run = launch(tmp_path, "sac", "-i", str(agent), "-n", "4", "--eval-freq", "-1")
     assert SAC.load(final(run), device="cpu").learning_starts == 0
+
+
+def test_transitions_of_another_world_are_not_taken_into_the_target(zoo, tmp_path):
+    short = ["--eval-freq", "-1", "--save-replay-buffer", "-params", "policy_kwargs:dict(net_arch=[16])"]
+    there = final(launch(tmp_path, "sac", "-n", "30", *short, env=SOURCE))
+    for env, held in ((TARGET, 4), (SOURCE, 34)):
+        run = launch(tmp_path, "sac", "-i", str(there), "-n", "4", *short, env=env)
+        model = SAC.load(final(run), device="cpu")
+        model.load_replay_buffer(run / "replay_buffer.pkl")
+        assert model.replay_buffer.size() == held
 
 
 def test_a_search_is_judged_on_the_target(zoo, agent, tmp_path, monkeypatch):

@@ -5,10 +5,12 @@ from __future__ import annotations
 import inspect
 import math
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.monitor import Monitor
 
@@ -176,6 +178,33 @@ def check_applicable(algorithm: str, updates_dynamics: bool, passed: Collection[
 def check_values_of(model: TwoWorlds) -> None:
     """:func:`check_values` of what a model was given."""
     check_values(dynamics=model.dynamics_backend, **{name: getattr(model, name) for name in CHECKED})
+
+
+@contextmanager
+def one_kind_of_temperature(settings: Mapping[str, Any]) -> Iterator[None]:
+    """While a zip is loaded with other settings: its temperature and theirs are either learned or fixed.
+
+    :raises ValueError: one is fixed where the other is learned
+    """
+    try:
+        yield
+    except AttributeError as error:  # of an optimizer of the temperature, in the zip alone or in the model alone
+        if "ent_coef" not in settings:
+            raise
+        raise ValueError(
+            "ent_coef: of the zip and what is asked for one fixes the temperature and the other learns it; leave it out"
+        ) from error
+
+
+def begin_temperature(model: SAC, ent_coef: Any) -> None:
+    """Let a learned temperature begin where ``ent_coef="auto_0.5"`` says, also where a zip has brought another.
+
+    :param model: whose parameters were loaded
+    :param ent_coef: as it was asked for now; others than ``"auto_"`` and a number change nothing
+    """
+    _, given, begin = str(ent_coef).partition("auto_")
+    if given and model.log_ent_coef is not None:
+        model.log_ent_coef.data.fill_(math.log(float(begin)))
 
 
 def check_values(

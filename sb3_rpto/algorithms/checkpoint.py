@@ -19,7 +19,12 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_rpto.algorithms.arguments import check_values_of, constructor_names
+from sb3_rpto.algorithms.arguments import (
+    begin_temperature,
+    check_values_of,
+    constructor_names,
+    one_kind_of_temperature,
+)
 from sb3_rpto.algorithms.bookkeeping import STEP, TARGET_SEED_OFFSET, RuleOfEnvironment, TwoWorlds
 from sb3_rpto.algorithms.machine import check_simulator
 from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
@@ -48,7 +53,9 @@ NOT_SAVED = (
 
 
 #: Arguments that the saved dynamics were built by.
-FIXED = frozenset({"dynamics", "dynamics_kwargs", "declared", "close_loop", "preset", "target_data"})
+FIXED = frozenset(
+    {"dynamics", "dynamics_kwargs", "declared", "close_loop", "preset", "target_data", "use_sde", "n_steps"}
+)
 #: What a VecNormalize keeps of the last step as it was.
 RAW = ("old_obs", "old_reward")
 
@@ -110,6 +117,9 @@ class Resumable(TwoWorlds):
                 f"{path} holds observations and actions of shapes {shapes[0]}, the model's are {shapes[1]}; load the "
                 "buffers that were saved beside it"
             )
+        asked = (self.replay_buffer_kwargs or {}).get("target_size")
+        if asked is not None:  # load() may have been given another than was saved
+            self.replay_buffer.resize("target", asked)
         if self.replay_buffer.estimated and self.target_env is not None:  # a target has taken the log's place
             self._drop_target_data()
 
@@ -138,14 +148,16 @@ class Resumable(TwoWorlds):
         fixed = sorted(FIXED & set(kwargs))
         if fixed:
             raise ValueError(
-                f"load() does not change {', '.join(fixed)}, which the saved dynamics have; begin anew by "
+                f"load() does not change {', '.join(fixed)}, which the saved model was made with; begin anew by "
                 f"{cls.__name__}.from_source(...) of the source's SAC"
             )
         known = constructor_names(cls) | set(inspect.signature(SAC.load).parameters)
         for name in kwargs:
             if name not in known:
                 raise ValueError(f"load() was given {name!r}, which is no argument; {near(name, known)}")
-        model = super().load(path, gym.make(env) if isinstance(env, str) else env, *args, **kwargs)
+        with one_kind_of_temperature(kwargs):
+            model = super().load(path, gym.make(env) if isinstance(env, str) else env, *args, **kwargs)
+        begin_temperature(model, kwargs.get("ent_coef"))
         if model._resume_state is None:
             raise ValueError(
                 f"{path} was not saved by {cls.__name__}; start from a SAC model by "

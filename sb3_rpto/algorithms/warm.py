@@ -116,7 +116,7 @@ def carry_over(sac: SAC, model: Resumable, temperature: bool = True) -> None:
 def fill_source(model: Resumable, source_data: ReplayBuffer | str | pathlib.Path) -> None:
     """Put recorded source transitions into D_source; branches may start from their states."""
     arrays = _checked(load_transitions(source_data), model, "source_data")
-    model.replay_buffer.resize_source(max(model.buffer_size, len(arrays["rewards"])))
+    model.replay_buffer.resize("source", max(model.buffer_size, len(arrays["rewards"])))
     _append_newest(model, "source", arrays)
     model.replay_buffer.source_starts = arrays["observations"].astype(model.observation_space.dtype)
 
@@ -162,7 +162,7 @@ def begin_in_source(model: Resumable, source_timesteps: int, progress_bar: bool)
     """
     buffer = model.replay_buffer
     if not model._warm and source_timesteps > 0:
-        buffer.resize_source(max(buffer.source.buffer_size, source_timesteps))
+        buffer.resize("source", max(buffer.source.buffer_size, source_timesteps))
         _train_in_source(model, source_timesteps, progress_bar)
     model._warm = True
     if "source" not in model.snapshots:
@@ -173,13 +173,13 @@ def begin_in_source(model: Resumable, source_timesteps: int, progress_bar: bool)
     if len(buffer.source_starts) == 0 and (model.num_timesteps == 0 or buffer.source.size() == 0):
         fits = learned is not None and not learned.fitted
         wanted = PHI_0_STEPS if fits else min(FIRST_SOURCE_STEPS, model.buffer_size)
-        buffer.resize_source(max(buffer.source.buffer_size, wanted))
+        buffer.resize("source", max(buffer.source.buffer_size, wanted))
         _collect_in_source(model, wanted - buffer.source.size())
         if learned is not None:
             buffer.source_starts = model.transitions("source").observations.cpu().numpy()[-PHI_0_STEPS:]
     if learned is not None and not learned.fitted:
         _fit_phi_0(model, learned)
-    buffer.resize_source(model.buffer_size)
+    buffer.resize("source", model.buffer_size)
 
 
 def _collect_in_source(model: Resumable, n_steps: int) -> None:

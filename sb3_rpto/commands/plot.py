@@ -137,13 +137,16 @@ def _result(file: Path) -> list[dict[str, Any]] | None:
         if "job" in content:  # of the benchmark: a method with its settings has a label
             shifted = env_id(content["job"]["task"], content["target"]["shift"])  # as of ``transfer``
             of_run = {"method": content["job"]["label"], "target": shifted, "seed": content["job"]["seed"]}
+            known = {name: content["job"].get(name) for name in ("settings", "episodes")}
+            agent = content.get("source", {}).get("sha256")
         else:
             of_run = {name: content["config"][name] for name in ("method", "target", "seed")}
-        of_run["settings"] = _chosen(content.get("config", {}))
+            known, agent = content["config"], content["config"].get("source_model_sha256")
+        of_run["settings"] = _chosen(known)
         if content.get("error"):
             print(f"sb3-rpto: left out, failed: {file}", file=sys.stderr)
         of_run["run"] = str(file)
-        of_run["agent"] = str(content.get("config", {}).get("source_model_sha256"))[:8]
+        of_run["agent"] = str(agent)[:8]
         return [{**of_run, "steps": row["steps"], "return": row["return"]} for row in content["rows"]]
     except (ValueError, KeyError, TypeError, AttributeError):
         if file.name == "result.json":
@@ -153,7 +156,7 @@ def _result(file: Path) -> list[dict[str, Any]] | None:
 
 def _chosen(config: dict[str, Any]) -> dict[str, Any]:
     """The settings of a run but a buffer as long as the run, which the command made so, and what it began with."""
-    settings = config.get("settings", {})
+    settings = config.get("settings") or {}
     chosen = {n: value for n, value in settings.items() if n != "buffer_size" or value != config.get("steps")}
     return chosen | {name: config[name] for name in BEGUN_WITH if config.get(name) is not None}
 

@@ -75,7 +75,12 @@ def statistics_of(path: str | Path) -> Path | None:
     :param path: of the zip
     """
     path = Path(path)
-    steps = path.stem.removeprefix("rl_model_")
+    prefix, _, steps = path.stem.removesuffix("_steps").rpartition("_")
+    own = (
+        "vecnormalize.pkl",
+        f"{prefix}_vecnormalize_{steps}_steps.pkl",
+        "statistics.pkl",
+    )  # the last: of our documents
     zoo = (file for file in path.parent.glob("*/vecnormalize.pkl") if file.with_name("args.yml").is_file())
-    found = (path.with_name("vecnormalize.pkl"), path.with_name(f"rl_model_vecnormalize_{steps}.pkl"), *zoo)
+    found = (*(path.with_name(name) for name in own), *zoo)
     return next((file for file in found if file.is_file()), None)

@@ -46,7 +46,7 @@ class Progress(BaseCallback):
 
     def _on_step(self) -> bool:
         taken = sum(self.num_timesteps >= self.total * n // COUNT for n in range(1, COUNT))
-        if taken > len(self.rows):
+        if taken > len(self.rows) and self.num_timesteps < self.total:  # the last row is that of the end
             self._add_row()
             self.run.save_checkpoint(self.num_timesteps, self._write)
         return True

@@ -111,8 +111,8 @@ def read(files: Sequence[str], form: str | None) -> Measurements:
 
 
 def digest(data: Measurements) -> str:
-    """SHA-256 of what was recorded, whatever files hold it."""
-    found = hashlib.sha256()
+    """SHA-256 of what was recorded and whose columns it is, whatever files hold it."""
+    found = hashlib.sha256(f"{data.columns}".encode())
     for episode in data.episodes:
         found.update(f"{episode.run} {episode.part} {dict(episode.params)}".encode())
         for values in (episode.time, episode.qpos, episode.qvel, episode.ctrl, episode.qfrc, episode.enabled):

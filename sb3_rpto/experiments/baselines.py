@@ -11,11 +11,13 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms.arguments import begin_temperature, one_kind_of_temperature
 from sb3_rpto.algorithms.distil import SquashedMeanPolicy, clone, clone_kwargs
 from sb3_rpto.algorithms.regression import regress
 from sb3_rpto.algorithms.source import EpisodeSource, make_source_world
@@ -43,17 +45,16 @@ def fine_tuned_sac(
     :param seed: of the run
     :param device: to learn on
     :param settings: attributes to change, e.g. ``gradient_steps``
-    :raises ValueError: for another ``train_freq``, or an ``ent_coef`` that is fixed where the source's is learned
+    :raises ValueError: for another ``train_freq``, ``use_sde`` or ``n_steps`` than the source model's, or an
+        ``ent_coef`` that is fixed where the source's is learned
     """
     check_step_by_step(settings)
-    try:
+    _check_made_so(source_model, settings)
+    with one_kind_of_temperature(settings):
         model = SAC.load(source_model, env=target, device=device, **settings)
-    except AttributeError as error:  # of an optimizer of the temperature, in the zip alone or in the model alone
-        if "ent_coef" not in settings:
-            raise
-        raise ValueError(
-            "ent_coef: of source model and settings one fixes the temperature and the other learns it; leave it out"
-        ) from error
+    begin_temperature(model, settings.get("ent_coef"))
+    if isinstance(model.replay_buffer, NStepReplayBuffer):
+        model.replay_buffer.gamma = model.gamma
     model.set_random_seed(seed)
     model.learning_starts = 0
     frequency, unit = cast(TrainFreq, model.train_freq)
@@ -62,6 +63,22 @@ def fine_tuned_sac(
         model.gradient_steps = max(round(model.gradient_steps / frequency), 1) if in_steps else 1
     model.train_freq = STEP_BY_STEP  # type: ignore[assignment]  # as SB3's own conversion does
     return model
+
+
+def _check_made_so(source_model: str | pathlib.Path, settings: Mapping[str, Any]) -> None:
+    """Refuse what a zip is made with, its networks or its replay buffer, where another is asked for.
+
+    :raises ValueError: with the remedy
+    """
+    asked = {name: settings[name] for name in ("use_sde", "n_steps") if name in settings}
+    data = (load_from_zip_file(source_model, device="cpu")[0] or {}) if asked else {}
+    for name, value in asked.items():
+        had = data.get(name, {"use_sde": False, "n_steps": 1}[name])  # n_steps is newer than some zips
+        if value != had:
+            raise ValueError(
+                f"{name} is {value!r} and the source model's {had!r}, which its zip is made with; leave it out, or "
+                "train a source model so"
+            )
 
 
 def check_step_by_step(settings: Mapping[str, Any]) -> None:
@@ -122,15 +139,18 @@ def with_more_critics(
     :raises ValueError: for fewer critics than the source model has, or another ``train_freq`` than 1
     """
     check_step_by_step(settings)
+    _check_made_so(source_model, settings)
     source = fine_tuned_sac(source_model, target, seed, device)
     check_critics(source, n_critics)
     old = source.critic.q_networks
-    arguments = {**warm.carried_arguments(source), "learning_starts": 0, "seed": seed, "device": device, **settings}
+    fixed = {"learning_starts": 0, "n_steps": source.n_steps, "seed": seed, "device": device}
+    arguments = {**warm.carried_arguments(source), **fixed, **settings}
     arguments["policy_kwargs"] = {**arguments["policy_kwargs"], "n_critics": n_critics}
     model = SAC("MlpPolicy", target, **arguments)
     model.actor.load_state_dict(source.actor.state_dict())
     if model.log_ent_coef is not None and source.log_ent_coef is not None:
         model.log_ent_coef.data.copy_(source.log_ent_coef.data)
+        begin_temperature(model, settings.get("ent_coef"))
     inputs = th.as_tensor(np.concatenate([data["observations"], data["actions"]], axis=1), device=model.device).float()
     for i, network in enumerate(model.critic.q_networks):
         teacher = old[i % len(old)]

@@ -15,6 +15,7 @@ from typing import Any
 import gymnasium as gym
 import optuna
 import yaml
+from huggingface_sb3 import EnvironmentName
 from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import get_callback_list
@@ -120,7 +121,7 @@ class TransferManager(ExperimentManager):
         for settings in (hyperparams, saved):
             settings.update(drawn)
         if self.resumes and self.start is not None:
-            had = config_beside(self.trained_agent)
+            had = settings_beside(self.trained_agent, "config.yml")
             kept = {name: had[name] for name in OUTSIDE if name in had and name not in self._asked}
             if kept:
                 print(f"As before: {', '.join(f'{name}: {value}' for name, value in kept.items())}")
@@ -193,7 +194,8 @@ class TransferManager(ExperimentManager):
         agent, source = self.trained_agent, self.start.source_env if self.start is not None else None
         if self.start is not None and self.start.source_model is not None and not agent:
             agent = self.start.source_model
-        folders = [Path(agent).parent / name for name in (source, Path(agent).stem) if name] if agent else []
+        names = [EnvironmentName(source) if source else None, Path(agent).stem]
+        folders = [Path(agent).parent / name for name in names if name] if agent else []
         candidates = [beside(agent, "vecnormalize"), *(folder / "vecnormalize.pkl" for folder in folders)]
         statistics = next((path for path in candidates if path is not None and path.is_file()), None)
         if statistics is None:
@@ -224,7 +226,12 @@ class TransferManager(ExperimentManager):
         if self.start is None:
             if self.algo == "sac":
                 hyperparams["learning_starts"] = 0  # a trained agent takes no random steps
-            return super()._load_pretrained_agent(hyperparams, env)
+            agent: Any = super()._load_pretrained_agent(hyperparams, env)
+            came_from = settings_beside(self.trained_agent, "args.yml").get("env")
+            if came_from is not None and EnvironmentName(str(came_from)) != self.env_name:
+                print(f"Trained in {came_from}: it begins here with an empty replay buffer")
+                agent.replay_buffer.reset()
+            return agent
         if not self.resumes:
             return self._begin(self.start, hyperparams, self._asked, env, self.create_target(), seed=self.seed)
         carried = sorted(self._asked - set(OUTSIDE))
@@ -375,10 +382,10 @@ def beside(trained_agent: str, kind: str) -> Path | None:
     if not trained_agent:
         return None
     path = Path(trained_agent)
-    stem = path.stem
-    if stem.startswith("rl_model_") and stem.endswith("_steps"):
-        return path.with_name(f"rl_model_{kind}_{stem.removeprefix('rl_model_')}.pkl")
-    return path.with_name(f"pretrain_{kind}.pkl" if stem == "pretrain" else f"{kind}.pkl")
+    prefix, _, steps = path.stem.removesuffix("_steps").rpartition("_")
+    if path.stem.endswith("_steps") and steps.isdigit():
+        return path.with_name(f"{prefix}_{kind}_{steps}_steps.pkl")
+    return path.with_name(f"pretrain_{kind}.pkl" if path.stem == "pretrain" else f"{kind}.pkl")
 
 
 def _applicable(drawn: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
@@ -391,12 +398,13 @@ def _applicable(drawn: dict[str, Any], settings: dict[str, Any]) -> dict[str, An
     return found
 
 
-def config_beside(trained_agent: str) -> dict[str, Any]:
-    """The settings that the zoo saved for the run of a zip; none where it is not in such a run's folder.
+def settings_beside(trained_agent: str, name: str) -> dict[str, Any]:
+    """What the zoo saved of the run of a zip; nothing where it is not in such a run's folder.
 
     :param trained_agent: the zip
+    :param name: ``config.yml``, the settings, or ``args.yml``, the command's arguments
     """
-    found = sorted(Path(trained_agent).parent.glob("*/config.yml"))
+    found = sorted(Path(trained_agent).parent.glob(f"*/{name}"))
     return dict(yaml.unsafe_load(found[0].read_text())) if len(found) == 1 else {}  # it holds an OrderedDict's tag
 
 

@@ -947,3 +947,27 @@ def test_action_noise_belongs_to_the_target():
     model = small(RPO, target=make_vec_env(lambda: pendulum(12.0), n_envs=2), action_noise=noise)
     model.learn(20, source_timesteps=0)
     assert model.action_noise.n_envs == 2
+
+
+def test_a_temperature_that_is_asked_for_is_where_a_loaded_model_begins(tmp_path):
+    small(RPO, ent_coef="auto").save(tmp_path / "m")
+    loaded = RPO.load(tmp_path / "m", ent_coef="auto_0.5")
+    assert loaded.log_ent_coef.exp().item() == pytest.approx(0.5)
+    with pytest.raises(ValueError, match="ent_coef: of the zip and what is asked for one fixes the temperature"):
+        RPO.load(tmp_path / "m", ent_coef=0.1)
+
+
+@pytest.mark.parametrize(("asked", "kept"), [(50, 12), (8, 8), (None, 12)], ids=["larger", "smaller", "as it was"])
+def test_a_target_side_is_as_large_as_asked_for(asked, kept, tmp_path):
+    model = small(RPO, replay_buffer_kwargs={"target_size": 20}).learn(12)
+    model.save(tmp_path / "m")
+    model.save_replay_buffer(tmp_path / "b")
+    given = {} if asked is None else {"replay_buffer_kwargs": {"target_size": asked}}
+    loaded = RPO.load(tmp_path / "m", pendulum(), target_env=pendulum(12.0), device="cpu", **given)
+    loaded.load_replay_buffer(tmp_path / "b")
+    buffer = loaded.replay_buffer
+    assert (buffer.buffer_size, buffer.target.buffer_size, buffer.size()) == (asked or 20, asked or 20, kept)
+    assert buffer.target_added == 12
+    for name, array in chronological(buffer.target).items():
+        np.testing.assert_array_equal(array, chronological(model.replay_buffer.target)[name][-kept:], err_msg=name)
+    loaded.learn(4, reset_num_timesteps=False)

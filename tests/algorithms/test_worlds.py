@@ -214,7 +214,7 @@ def test_another_optimizer_begins_anew(optimizer: type[th.optim.Optimizer]) -> N
     made.learn(10)
 
 
-@pytest.mark.parametrize("name", ["close_loop", "declared", "dynamics_kwargs", "preset"])
+@pytest.mark.parametrize("name", ["close_loop", "declared", "dynamics_kwargs", "preset", "use_sde", "n_steps"])
 def test_loading_refuses_what_it_cannot_change(name: str, tmp_path: Any) -> None:
     simulated(gym.make(POLE)).save(tmp_path / "model.zip")
     with pytest.raises(ValueError, match=rf"load\(\) does not change {name}"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -17,9 +18,11 @@ from sb3_rpto import RPTO, cli
 from sb3_rpto.algorithms import closing
 from sb3_rpto.commands import enjoy
 from sb3_rpto.commands.progress import Progress
+from sb3_rpto.commands.recordings import digest
 from sb3_rpto.effects import LIBRARY
 from sb3_rpto.effects.carry import load_corrected
 from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.tracing import Measurements
 
 ENV = "InvertedPendulum-v5"
 FEW = ["--steps", "320", "--set", "source_steps=4", "--set", "gradient_steps=2", "--device", "cpu", "--quiet"]
@@ -87,6 +90,34 @@ def test_a_log_becomes_a_report_a_simulator_and_a_policy(given: Path, tmp_path: 
     assert adapt(given, tmp_path) == 2
     assert "holds a run with recordings_sha256=" in capsys.readouterr().err
     log.write_text(kept)
+
+
+def test_exchanged_headers_are_another_log(given: Path, tmp_path: Path) -> None:
+    text = (given / "log.csv").read_text()
+    mended = text.replace("qpos.slider", "kept").replace("qpos.hinge", "qpos.slider").replace("kept", "qpos.hinge")
+    (tmp_path / "log.csv").write_text(mended)
+    logs = [Measurements.from_csv([str(folder / "log.csv")]) for folder in (given, tmp_path, given)]
+    first, other, again = map(digest, logs)
+    assert first == again != other
+
+
+@pytest.mark.parametrize("total", [300, 320, 5000])
+def test_a_run_ends_with_one_row_and_no_checkpoint_of_its_end(total: int, tmp_path: Path) -> None:
+    seen: list[int] = []
+
+    class Folder:
+        def save_checkpoint(self, steps: int, write: object) -> None:
+            seen.append(steps)
+
+    shown = Progress(Folder(), total, [], quiet=True)  # type: ignore[arg-type]
+    shown.model = SimpleNamespace(_n_updates=0, loop=SimpleNamespace(accounts=False))  # type: ignore[assignment]
+    for steps in range(160, total + 160, 160):
+        shown.num_timesteps = min(steps, total)
+        shown._on_step()
+    shown._on_training_end()
+    rows = [row["steps"] for row in shown.rows]
+    assert rows == [*seen, total]
+    assert len({*rows}) == len(rows)
 
 
 def test_its_folder_is_enjoyed_in_the_corrected_simulator(given: Path, tmp_path: Path, capsys) -> None:

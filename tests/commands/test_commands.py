@@ -25,7 +25,7 @@ from sb3_rpto import RPO, RPTO, cli
 from sb3_rpto.algorithms.slbo import SLBO
 from sb3_rpto.commands import enjoy, options, video
 from sb3_rpto.commands.plot import draw, read_rows
-from sb3_rpto.commands.policies import load_policy
+from sb3_rpto.commands.policies import load_policy, statistics_of
 from sb3_rpto.commands.runs import RunFolder, SavedCurve
 from sb3_rpto.effects.carry import load_corrected
 from sb3_rpto.experiments.curve import evaluate
@@ -587,6 +587,48 @@ def test_normalised_observations_are_told(
     assert f"normalised by {folder / 'vecnormalize.pkl'}" in error(capsys)
     assert cli.main(["enjoy", str(tmp_path / "Some-v0.zip"), TARGET, "--episodes", "1"]) == 0
     assert f"normalised by {folder / 'vecnormalize.pkl'}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("model", "statistics"),
+    [
+        ("rl_model_20_steps.zip", "rl_model_vecnormalize_20_steps.pkl"),
+        ("my_sac_20_steps.zip", "my_sac_vecnormalize_20_steps.pkl"),
+        ("model.zip", "statistics.pkl"),
+    ],
+)
+def test_statistics_beside_a_zip_are_found_by_its_name(model: str, statistics: str, tmp_path: Path) -> None:
+    assert statistics_of(tmp_path / model) is None
+    (tmp_path / "my_sac_vecnormalize_10_steps.pkl").touch()
+    assert statistics_of(tmp_path / model) is None
+    (tmp_path / statistics).touch()
+    assert statistics_of(tmp_path / model) == tmp_path / statistics
+
+
+def test_a_finished_run_without_its_model_says_how_it_comes_back(
+    agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(agent, tmp_path / "run")
+    (tmp_path / "run" / "model.zip").unlink()
+    assert cli.main(["enjoy", str(tmp_path / "run")]) == 2
+    assert "its run is finished and model.zip is gone; remove result.json" in error(capsys)
+
+
+def test_curves_of_a_benchmark_are_told_apart_by_settings_and_agents(tmp_path: Path) -> None:
+    def wrote(name: str, settings: dict[str, int], agent: str, seed: int) -> None:
+        job = {"task": "Hopper", "label": "rpto", "seed": seed, "settings": settings, "episodes": 5}
+        rows = [{"steps": 0, "return": 1.0}]
+        content = {"job": job, "source": {"sha256": agent}, "target": {"shift": "limb-x2"}, "rows": rows}
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+
+    wrote("a", {"gradient_steps": 5}, "a" * 64, 0)
+    wrote("b", {"gradient_steps": 20}, "a" * 64, 0)
+    wrote("c", {"gradient_steps": 20}, "b" * 64, 0)
+    assert {row["method"] for row in read_rows([tmp_path])} == {
+        "rpto gradient_steps=5",
+        "rpto gradient_steps=20 agent=aaaaaaaa",
+        "rpto gradient_steps=20 agent=bbbbbbbb",
+    }
 
 
 def test_drawn_actions_follow_the_seed(agent: Path, capsys: pytest.CaptureFixture[str]) -> None:

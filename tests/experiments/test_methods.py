@@ -294,11 +294,38 @@ def test_a_fine_tuned_sac_meets_its_budget_step_by_step_whatever_the_source_did(
 
 @pytest.mark.parametrize(
     ("settings", "said"),
-    [({"train_freq": 2}, "train_freq is 2, .* give 1"), ({"ent_coef": 0.1}, "ent_coef: .* leave it out")],
+    [
+        ({"train_freq": 2}, "train_freq is 2, .* give 1"),
+        ({"ent_coef": 0.1}, "ent_coef: .* leave it out"),
+        ({"use_sde": True}, "use_sde is True and the source model's False"),
+        ({"n_steps": 3}, "n_steps is 3 and the source model's 1"),
+    ],
 )
 def test_settings_that_fine_tuning_cannot_have_are_named(source_model: str, settings: Any, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         baselines.fine_tuned_sac(source_model, cartpole(), 0, **settings)
+
+
+def test_a_temperature_that_is_asked_for_is_where_fine_tuning_begins(source_model: str) -> None:
+    data, _ = baselines.source_transitions(source_model, cartpole(), 0)
+    asked: dict[str, Any] = {"ent_coef": "auto_0.5", "use_sde": False, "n_steps": 1}  # the latter as it has them
+    for model in (
+        baselines.fine_tuned_sac(source_model, cartpole(), 0, **asked),
+        baselines.with_more_critics(source_model, cartpole(), 0, 3, data, **asked),
+    ):
+        assert model.log_ent_coef is not None
+        assert float(model.log_ent_coef.exp().item()) == pytest.approx(0.5)
+
+
+def test_a_discount_holds_for_returns_of_several_steps_too(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"policy_kwargs": SMALL_POLICY, "n_steps": 3, "learning_starts": 5, "device": "cpu"}
+    SAC("MlpPolicy", cartpole(), **settings).save(tmp_path / "sac.zip")
+    model = baselines.fine_tuned_sac(tmp_path / "sac.zip", cartpole(), 0, gamma=0.5)
+    assert model.gamma == model.replay_buffer.gamma == 0.5  # type: ignore[union-attr]
+    data, _ = baselines.source_transitions(tmp_path / "sac.zip", cartpole(), 0)
+    assert baselines.with_more_critics(tmp_path / "sac.zip", cartpole(), 0, 3, data).replay_buffer.n_steps == 3  # type: ignore[union-attr]
+    with pytest.raises(ValueError, match="n_steps is 1 and the source model's 3"):
+        baselines.fine_tuned_sac(tmp_path / "sac.zip", cartpole(), 0, n_steps=1)
 
 
 def test_fresh_source_transitions_are_as_many_as_they_cost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
