@@ -140,6 +140,7 @@ class PDML(MBPO):
     @th.no_grad()
     def distance(self, block: Block) -> float:
         """Mean distance of the present policy to the one at a block's end, over states of D_target."""
+        self.actor.set_training_mode(False)  # after updates: dropout and batch statistics would join in
         seen = self._normalised(self.transitions("target").take(slice(-STATES, None)).observations)
         present = {name: value.clone() for name, value in self.actor.state_dict().items()}
         mean, log_std, _ = self.actor.get_action_dist_params(seen)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -22,6 +22,7 @@ from sb3_rpto.dynamics.base import Dynamics, Prediction
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
+from sb3_rpto.effects import Effect
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.state import reseed, restore_state, save_state, whereabouts
@@ -135,8 +136,6 @@ class EpisodeSource(SourceWorld):
             timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
             scaled = model.policy.scale_action(actions)
             model.replay_buffer.append("source", raw_obs, raw_next, scaled, rewards, dones, timeouts, infos)
-            for i in np.flatnonzero(dones):
-                self._episode_ended(int(i))
             if dones.any() and _draws_by_episode(model):
                 held = math.inf
             for info in infos:
@@ -147,9 +146,6 @@ class EpisodeSource(SourceWorld):
             steps += self.env.num_envs
         self._left_at = whereabouts(self.env)
         return steps
-
-    def _episode_ended(self, index: int) -> None:
-        """An environment has just begun a new episode."""
 
     def _raw(self, obs: Any) -> np.ndarray:
         """The observations that the environments just gave, not normalised; a copy."""
@@ -180,6 +176,24 @@ class EpisodeSource(SourceWorld):
         self._left_at = None  # the source itself is put back elsewhere
 
 
+class DrawnEnv(StandingEnv):
+    """A simulator with other effects in each episode, drawn before it begins: it starts as the machine that it is.
+
+    :param env: as of :class:`~sb3_rpto.effects.stance.StandingEnv`
+    :param effects: until its first reset
+    :param draw: the next episode's
+    """
+
+    def __init__(self, env: gym.Env, effects: Sequence[Effect], draw: Callable[[], Sequence[Effect]]) -> None:
+        self._draw = draw
+        super().__init__(env, effects)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode of another machine."""
+        self.set_effects(self._draw())
+        return super().reset(seed=seed, options=options)
+
+
 class SimulatorSource(EpisodeSource):
     """Whole episodes of copies of the source with phi in it; rewards, terminations and resets are the source's own.
 
@@ -191,7 +205,7 @@ class SimulatorSource(EpisodeSource):
 
     def __init__(self, dynamics: PhysicalDynamics, env: VecEnv, num_envs: int) -> None:
         self.dynamics = dynamics
-        self.copies = [StandingEnv(copied(env), dynamics.effects()) for _ in range(num_envs)]
+        self.copies = [self._simulator(copied(env)) for _ in range(num_envs)]
         # What episodes earn is told by a Monitor, which SB3 puts around single environments, not around a VecEnv's.
         told = [copy if is_wrapped(copy, Monitor) else Monitor(copy) for copy in self.copies]
         makers: list[Callable[[], gym.Env]] = [lambda copy=copy: copy for copy in told]  # type: ignore[misc]
@@ -221,9 +235,11 @@ class SimulatorSource(EpisodeSource):
                 copy.set_effects(self.dynamics.effects(self._rng))
         return super().interact(model, n_steps, random)
 
-    def _episode_ended(self, index: int) -> None:
-        if self.dynamics.randomise > 0:
-            self.copies[index].set_effects(self.dynamics.effects(self._rng))
+    def _simulator(self, copy: gym.Env) -> StandingEnv:
+        effects = self.dynamics.effects()
+        if self.dynamics.randomise == 0:
+            return StandingEnv(copy, effects)
+        return DrawnEnv(copy, effects, lambda: self.dynamics.effects(self._rng))
 
     def get_state(self) -> dict[str, Any]:
         """Where the episodes stand, the simulators included."""
@@ -270,7 +286,8 @@ class BranchSource(SourceWorld):
         self.rollout_start = rollout_start
 
     def interact(self, model: RelativeUpdate, n_steps: int) -> int:
-        """Branch ``n_steps`` times, all at once; see :meth:`SourceWorld.interact`."""
+        """Branch ``n_steps`` times, all at once, but not more often than D_source holds."""
+        n_steps = min(n_steps, model.replay_buffer.source.buffer_size)
         starts = self._starts(model, n_steps)
         normaliser = model.get_vec_normalize_env()
         seen = starts if normaliser is None else normaliser.normalize_obs(starts)
@@ -296,7 +313,8 @@ class BranchSource(SourceWorld):
     def _starts(self, model: RelativeUpdate, n: int) -> np.ndarray:
         """Observations to branch from, (n, observation_dim), raw."""
         buffer = model.replay_buffer
-        n_target = {"target": n, "source": 0, "mix": n // 2}[self.rollout_start]
+        odd = int(np.random.randint(2)) if self.rollout_start == "mix" and n % 2 else 0
+        n_target = {"target": n, "source": 0, "mix": n // 2 + odd}[self.rollout_start]
         if buffer.target.size() == 0:
             n_target = 0  # before the first target transition only the source has states
         pools = []
@@ -305,7 +323,9 @@ class BranchSource(SourceWorld):
         if n > n_target:
             rows = np.random.randint(len(buffer.source_starts), size=n - n_target)
             pools.append(buffer.source_starts[rows])
-        return np.concatenate(pools)
+        # In turns, so that those which D_source forgets first are of both.
+        order = np.argsort(np.concatenate([np.arange(len(pool)) / len(pool) for pool in pools]), kind="stable")
+        return np.concatenate(pools)[order]
 
 
 def sample_policy(model: RelativeUpdate, observations: th.Tensor) -> th.Tensor:

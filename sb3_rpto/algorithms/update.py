@@ -90,6 +90,8 @@ class RelativeUpdate(SAC):
         :param batch_size: transitions in a batch
         """
         self.policy.set_training_mode(True)
+        if not (self.updates_policy or self._pretraining):  # its batch statistics stay, too
+            self.actor.set_training_mode(False)
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
@@ -129,9 +131,9 @@ class RelativeUpdate(SAC):
         ent_coef = self.temperature()
         losses = {"ent_coef": ent_coef}
         policy_learns = self.updates_policy or self._pretraining
+        if self.use_sde:  # for the critic's next actions, too
+            self.actor.reset_noise()
         if policy_learns:
-            if self.use_sde:
-                self.actor.reset_noise()
             actions_pi, log_prob = sample_actions(self.actor, actor_batch.observations)
             if descend.ent_coef is not None:
                 losses["ent_coef_loss"] = self.temperature_loss(log_prob)

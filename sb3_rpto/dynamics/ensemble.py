@@ -205,12 +205,24 @@ class EnsembleDynamics(Dynamics):
             ``fit_seconds``
         :raises ValueError: too few transitions, a wrong shape, values that are not finite, bad weights
         """
+        return self.fit_rows(data, th.arange(len(data)), weights, max_steps)
+
+    def fit_rows(
+        self, data: Transitions, rows: th.Tensor, weights: th.Tensor | None, max_steps: int | None
+    ) -> dict[str, float]:
+        """:meth:`fit` to some of all transitions that there ever were: what one call trains on no later one holds out.
+
+        :param data: the transitions
+        :param rows: their numbers, ascending, (n,)
+        :param weights: as there
+        :param max_steps: as there
+        """
         started = time.perf_counter()
         max_steps = self.max_steps if max_steps is None else max_steps
         if max_steps < 1:
             raise ValueError(f"max_steps must be at least 1, got {max_steps}")
         with fast_products(self.device), no_denormals():
-            train, held = self._prepare(data, weights)
+            train, held = self._prepare(data, weights, rows)
             best_nll, best_error = self._judge(held)
             mark, best_state = best_error, [p.detach().clone() for p in self.networks.parameters()]
             steps, epochs, stale, train_nll = 0, 0, 0, math.nan
@@ -248,16 +260,18 @@ class EnsembleDynamics(Dynamics):
             "fit_seconds": time.perf_counter() - started,
         }
 
-    def holdout_mask(self, n: int) -> th.Tensor:
-        """Which of the first ``n`` transitions are held out, (n,) bool.
+    def holdout_mask(self, rows: th.Tensor) -> th.Tensor:
+        """Which transitions are held out, (n,) bool.
 
-        Transition i is held out if the fractional part of i times the golden ratio is below ``holdout_ratio``, and
-        among the ``max_holdout`` smallest: an even share of every stretch of data, in step with no period of it
-        (several environments, an episode's length). As data are added the bound falls: what was trained on is never
-        held out later.
+        Transition i of all that there ever were is held out if the fractional part of i times the golden ratio is
+        below ``holdout_ratio``, and among the ``max_holdout`` smallest: an even share of every stretch of data, in
+        step with no period of it (several environments, an episode's length). As data are added the bound falls: what
+        was trained on is never held out later.
+
+        :param rows: the transitions' numbers, (n,)
         """
-        share = (th.arange(n, dtype=th.float64) * ((math.sqrt(5.0) - 1.0) / 2.0)).frac()
-        held = share < self.holdout_ratio
+        share = (rows.cpu().double() * ((math.sqrt(5.0) - 1.0) / 2.0)).frac()
+        held = share <= max(self.holdout_ratio, float(share.min()))  # one at least
         if int(held.sum()) > self.max_holdout:
             held = share <= share.kthvalue(self.max_holdout).values
         return held.to(self.device)
@@ -289,7 +303,9 @@ class EnsembleDynamics(Dynamics):
         nll = (held.weights * heads.nll(held.targets, held.terminations)).mean(dim=1)
         return nll, (held.weights * heads.squared_error(held.targets, held.terminations)).mean(dim=1)
 
-    def _prepare(self, data: Transitions, weights: th.Tensor | None) -> tuple[_Examples, _Examples]:
+    def _prepare(
+        self, data: Transitions, weights: th.Tensor | None, rows: th.Tensor | None = None
+    ) -> tuple[_Examples, _Examples]:
         """Check, fit the scaler if nothing was fitted before, standardise and split."""
         n = len(data)
         if n < 2:
@@ -303,7 +319,7 @@ class EnsembleDynamics(Dynamics):
         _check("weights", weights, (n,))
         if (weights < 0).any() or not (weights > 0).any():
             raise ValueError("weights must be non-negative and not all zero")
-        held_out = self.holdout_mask(n)
+        held_out = self.holdout_mask(th.arange(n) if rows is None else rows)
         # the difference in the data's own dtype: float32 would round it away at large positions
         change = data.next_observations - data.observations
         targets = th.cat([change, data.rewards.unsqueeze(1)], dim=1)

@@ -26,6 +26,8 @@ REACHES = 0.25 ** np.arange(5)
 #: A parameter that moves no residual by this share of the typical one, for a change by its scale, is not identified,
 #: nor is one whose standard error is more than this many of its scales.
 UNSEEN, VAGUE = 1e-3, 1.0
+#: Scores of so many transitions in a row may be correlated.
+LAGS = 4
 #: Contacts make local optima: the loss turns linear at so many typical residuals, so that a missed touch-down is borne.
 CLIP = 3.0
 #: Residuals of what blows up, in standard one-step changes.
@@ -43,6 +45,7 @@ class Steps:
     :param reached: positions and velocities after the step, (n, nq + nv)
     :param scale: standard change in one step of those, (nq + nv,); inf where nothing moves or is known
     :param unobserved: which positions and speeds no observation tells, (nq + nv,)
+    :param before: the step that each follows, by its place among these; -1 where it is not among them, (n,)
     """
 
     rows: np.ndarray
@@ -52,6 +55,7 @@ class Steps:
     reached: np.ndarray
     scale: np.ndarray
     unobserved: np.ndarray
+    before: np.ndarray
 
     def __len__(self) -> int:
         return len(self.qpos)
@@ -117,7 +121,10 @@ def as_steps(
     spread = (reached - begun).std(axis=0) if len(rows) else np.zeros(len(ever))
     qpos, qvel = np.split(begun, [model.nq], axis=1)
     scale = np.where(ever & (spread > 1e-8), np.maximum(spread, 1e-8), np.inf)
-    return Steps(rows, qpos, qvel, Drive(drive, earlier * frame_skip, hold=frame_skip), reached, scale, ~ever)
+    place = np.full(len(data) + 1, -1)  # the last stands for what follows nothing
+    place[rows] = np.arange(len(rows))
+    drives = Drive(drive, earlier * frame_skip, hold=frame_skip)
+    return Steps(rows, qpos, qvel, drives, reached, scale, ~ever, place[before[rows]])
 
 
 def remembered(model: mujoco.MjModel, frame_skip: int) -> int:
@@ -260,8 +267,10 @@ class OneStep:
         return np.asarray(self.share[:, None] / np.sqrt(1 + (residual / self.clip) ** 2))
 
     def deviation(self, values: np.ndarray) -> np.ndarray:
-        """Standard deviation of phi by the sandwich estimate, each transition an observation, (p,).
+        """Standard deviation of phi by the sandwich estimate (Huber 1967), (p,).
 
+        Scores of up to :data:`LAGS` transitions in a row may be correlated (Newey and West 1987): an observation that
+        errs ends one transition and begins the next, and what the simulator lacks lasts longer than a transition.
         Infinite for what the transitions do not show or tell apart.
         """
         spread = self._spread(*self._curvature(values), ~self.held & ~self.left) * self.scale
@@ -285,18 +294,29 @@ class OneStep:
     def _curvature(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of the cost at phi, in scales: about its Hessian (p, p), and each transition's part of its slope (n, p)."""
         residual, slopes = self.linearise(values, DIFFERENCES[1])
-        robust = self.robust(residual)
-        hessian = np.einsum("nc,ncp,ncq->pq", robust, slopes, slopes)
-        return hessian, np.einsum("nc,ncp,nc->np", robust, slopes, residual)
+        # The loss's own second derivative: the least squares that stand for it in a step curve more.
+        curved = self.share[:, None] * (1 + (residual / self.clip) ** 2) ** -1.5
+        hessian = np.einsum("nc,ncp,ncq->pq", curved, slopes, slopes)
+        return hessian, np.einsum("nc,ncp,nc->np", self.robust(residual), slopes, residual)
 
     def _spread(self, hessian: np.ndarray, scores: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Standard deviations in scales where only the ``free`` ones move; infinite for others and without slope."""
         moving = np.flatnonzero((np.diag(hessian) > 0) & free)
         inverse = np.linalg.pinv(hessian[np.ix_(moving, moving)], rcond=1e-10, hermitian=True)
-        meat = scores[:, moving].T @ scores[:, moving]
+        meat = self._scatter(scores[:, moving])
         spread = np.full(len(free), np.inf)
         spread[moving] = np.sqrt(np.maximum(np.diag(inverse @ meat @ inverse), 0.0))
         return spread
+
+    def _scatter(self, scores: np.ndarray) -> np.ndarray:
+        """Covariance of the sum of the transitions' scores (n, p), by Newey and West's weights; (p, p)."""
+        found, past = scores.T @ scores, np.arange(len(scores))
+        for lag in range(1, LAGS + 1):
+            past = np.where(past < 0, -1, self.steps.before[past])
+            after = past >= 0
+            products = scores[after].T @ scores[past[after]]
+            found += (1 - lag / (LAGS + 1)) * (products + products.T)
+        return found
 
 
 def _shown(a: np.ndarray, b: np.ndarray) -> np.ndarray:

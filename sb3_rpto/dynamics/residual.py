@@ -194,11 +194,14 @@ class ResidualDynamics(Dynamics):
         self.corrected.fill_(False)
         usable = self._usable(data)
         if len(usable) >= MIN_TRANSITIONS:
-            log |= self._fit_ensemble(data.take(usable), None if weights is None else weights[usable], max_steps)
+            log |= self._fit_ensemble(data, usable, weights, max_steps)
         return {**log, "residual_on": float(self.corrected.any())}
 
-    def _fit_ensemble(self, data: Transitions, weights: th.Tensor | None, max_steps: int | None) -> dict[str, float]:
-        """Fit the ensemble to what the simulator misses, and set the mask."""
+    def _fit_ensemble(
+        self, every: Transitions, usable: th.Tensor, weights: th.Tensor | None, max_steps: int | None
+    ) -> dict[str, float]:
+        """Fit the ensemble to what the simulator misses of the ``usable`` rows, (m,), and set the mask."""
+        data = every.take(usable)
         observations, next_observations = data.observations.double(), data.next_observations.double()
         missed = next_observations - self.physical.step(observations, data.actions).next_observations
         missed = missed.nan_to_num(0.0, 0.0, 0.0)  # a simulation that blew up tells nothing
@@ -217,7 +220,8 @@ class ResidualDynamics(Dynamics):
             examples = Transitions(observations, data.actions.double(), nothing, wanted, nothing)
             # The residual shrinks while phi is fitted, and its scaler must follow; the holdout judges the jump.
             self.ensemble.fitted.fill_(False)
-            self.ensemble.fit(examples.take(train), None if weights is None else weights[train], max_steps)
+            shares = None if weights is None else weights[usable][train]
+            self.ensemble.fit_rows(examples.take(train), usable[train], shares, max_steps)
             correction = self._correction(observations[held], data.actions[held], deterministic=True)
             after = _rms((missed[held] - correction).clamp(-reach, reach) / scale)
             self.corrected.copy_(worth & (after < (1.0 - GAIN) * before))

@@ -36,7 +36,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 from stable_baselines3.sac.policies import SACPolicy
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_rpto import RPO, RPTO
+from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
@@ -253,6 +253,42 @@ def test_every_branch_has_exploration_noise_of_its_own(cls):
     side = model.replay_buffer.source
     newest = side.actions[: side.size(), 0, 0][-8:]
     assert len(set(newest.tolist())) == 8
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_every_update_has_exploration_noise_of_its_own(cls, monkeypatch):
+    model, seen = learn(build(cls, Still(), Still(), use_sde=True, learning_starts=0), 5), []
+    loss = cls.critic_loss
+
+    def watched(self, batch, ent_coef):
+        seen.append(self.actor.action_dist.exploration_mat[0, 0].item())
+        return loss(self, batch, ent_coef)
+
+    monkeypatch.setattr(cls, "critic_loss", watched)
+    model.train(6, 8)
+    assert len(set(seen)) == 6
+
+
+class Normed(BaseFeaturesExtractor):
+    """Batch normalisation alone."""
+
+    def __init__(self, space):
+        super().__init__(space, space.shape[0])
+        self.norm = th.nn.BatchNorm1d(space.shape[0])
+
+    def forward(self, observations):
+        return self.norm(observations)
+
+
+def test_a_policy_that_stays_keeps_its_batch_statistics():
+    policy_kwargs = {"net_arch": [8], "features_extractor_class": Normed}
+    model = learn(build(RTO, policy_kwargs=policy_kwargs, learning_starts=0), 5)
+    before = {name: value.clone() for name, value in model.actor.state_dict().items()}
+    critics = model.critic.features_extractor.norm.running_mean.clone()
+    model.train(6, 8)
+    for name, value in model.actor.state_dict().items():
+        assert th.equal(value, before[name]), name
+    assert not th.equal(model.critic.features_extractor.norm.running_mean, critics)
 
 
 @ours

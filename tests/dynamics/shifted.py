@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
-from sb3_rpto.dynamics.base import Transitions
+from sb3_rpto.dynamics.base import Transitions, predecessors
 from sb3_rpto.effects import declare
 from sb3_rpto.envs.corrected import apply_effects
 
@@ -49,3 +49,15 @@ def noisy(data, level, seed=0):
     """The same with noise on what is reached."""
     noise = level * np.random.default_rng(seed).standard_normal(data.next_observations.shape)
     return replace(data, next_observations=data.next_observations + th.as_tensor(noise))
+
+
+def observed(data, level, seed=0):
+    """The same as sensors with noise show it: what ends a transition begins the next."""
+    rng, before = np.random.default_rng(seed), predecessors(data.observations.numpy(), data.next_observations.numpy())
+    begins, ends = (level * rng.standard_normal(data.observations.shape) for _ in range(2))
+    begins[before >= 0] = ends[before[before >= 0]]
+    return replace(
+        data,
+        observations=data.observations.double() + th.as_tensor(begins),
+        next_observations=data.next_observations.double() + th.as_tensor(ends),
+    )

@@ -4,9 +4,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from shifted import HOPPER, POLE, POLES, SHIFTS, collect, joined, noisy, shifted
+from shifted import HOPPER, POLE, POLES, SHIFTS, collect, joined, noisy, observed, shifted
 
-from sb3_rpto.dynamics.onestep import BLOWN, FILTERED, MEMORY, OneStep, as_steps
+from sb3_rpto.dynamics.onestep import BLOWN, FILTERED, LAGS, MEMORY, OneStep, as_steps
 from sb3_rpto.effects import Simulation, declare
 from sb3_rpto.effects.commands import ActuatorLag, CommandDelay
 from sb3_rpto.effects.friction import StribeckFriction
@@ -319,6 +319,55 @@ def test_weights_count_for_the_rows_they_belong_to():
     assert task.share.sum() == pytest.approx(1)
     assert task.cost(task.residuals(np.array([[0.55]])))[0] > 0  # the damping is wrong
     np.testing.assert_array_equal(task.robust(np.ones((23, 11)))[~np.isin(steps.rows, good)], 0)
+
+
+def test_the_curvature_is_the_costs_second_derivative():
+    task = problem(steps_of(noisy(collect(shifted(POLE, {"pole.mass": 7.0}), 40), 2e-2, 0), POLE), ["pole.mass"], POLE)
+    values = np.array([7.0])
+    task.step(values, 0.1)  # sets where the loss turns linear
+    assert np.mean(np.abs(task.residuals(values[None])) > task.clip) > 0.1  # many are where it is linear
+
+    def slope(by):
+        residual, slopes = task.linearise(values + by * task.scale, 1e-4)
+        return float(np.einsum("nc,ncp,nc->", task.robust(residual), slopes, residual))
+
+    hessian, scores = task._curvature(values)
+    assert hessian[0, 0] == pytest.approx((slope(0.01) - slope(-0.01)) / 0.02, rel=0.05)
+    assert scores.sum() == pytest.approx(slope(0.0), rel=0.01)
+
+
+def test_scores_in_a_row_count_together_and_others_alone():
+    data = collect(shifted(POLE), 24)
+    data.observations[9, 2] = 10.0  # left out
+    task = problem(steps_of(data, POLE), ["pole.mass"], POLE)
+    begins = [i for i, before in enumerate(task.steps.before) if before < 0]
+    assert task.steps.before[1] == 0
+    assert 9 in begins
+    scores = np.random.default_rng(0).normal(size=(23, 2))
+    expected = np.zeros((2, 2))
+    for i in range(23):
+        for j in range(23):
+            apart = abs(i - j)
+            if apart <= LAGS and not any(min(i, j) < b <= max(i, j) for b in begins):
+                expected += (1 - apart / (LAGS + 1)) * np.outer(scores[i], scores[j])
+    np.testing.assert_allclose(task._scatter(scores), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["torque", "noise"])
+def test_the_truth_is_as_often_within_the_deviation_as_it_says(kind):
+    """Of repeated data sets, with random torques, or with observations that end one step and begin the next."""
+    clean = collect(shifted(POLE, {"pole.mass": 7.0}), 60)
+    off = []
+    for seed in range(40):
+        data = noisy(clean, 2e-3, seed) if kind == "torque" else observed(clean, 1e-3, seed)
+        task = problem(steps_of(data, POLE), ["pole.mass"], POLE)
+        values = np.array([7.0])
+        while (moved := task.step(values, 0.1)) is not None and abs(moved[0] - values[0]) > 1e-4:
+            values = moved
+        off.append(abs(values[0] - 7.0) / task.deviation(values)[0])
+    assert np.mean(np.array(off) < 1.96) > 0.85
+    assert np.mean(np.array(off) < 0.5) > 0.1  # and not as if it were much less certain
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 import copy
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 
 import gymnasium as gym
 import numpy as np
@@ -230,7 +232,7 @@ def test_a_missed_touch_down_counts_as_three_times_what_others_miss_at_most(data
     jumps = th.zeros_like(data.observations)
     jumps[::50] = 20.0
     dynamics, taught = make(), []
-    monkeypatch.setattr(dynamics.ensemble, "fit", lambda examples, weights, max_steps: taught.append(examples))
+    monkeypatch.setattr(dynamics.ensemble, "fit_rows", lambda examples, *others: taught.append(examples))
     dynamics.fit(replace(data, next_observations=data.next_observations + jumps))
     (examples,) = taught
     missed = (examples.next_observations - examples.observations).abs()
@@ -254,18 +256,38 @@ def test_unknown_states_are_left_out():
 def test_weights_and_caps_reach_both_parts(data, monkeypatch):
     dynamics, seen = make(), []
     weights = th.rand(len(data), generator=th.Generator().manual_seed(0))
-    for part in (dynamics.physical, dynamics.ensemble):
+    physical, ensemble = dynamics.physical.fit, dynamics.ensemble.fit_rows
 
-        def fit(data, weights=None, max_steps=None, original=part.fit):
-            seen.append((len(data), weights, max_steps))
-            return original(data, weights, max_steps)
+    def fit(original, data, *others):
+        seen.append((len(data), *others[-2:]))
+        return original(data, *others)
 
-        monkeypatch.setattr(part, "fit", fit)
+    monkeypatch.setattr(dynamics.physical, "fit", partial(fit, physical))
+    monkeypatch.setattr(dynamics.ensemble, "fit_rows", partial(fit, ensemble))
     dynamics.fit(data, weights, max_steps=7)
     (n_all, given, cap), (n_train, trained, cap_too) = seen
     assert (n_all, n_train, cap, cap_too) == (400, 320, 7, 7)
     assert th.equal(given, weights)
     assert th.equal(trained, weights[:320])
+
+
+def test_what_was_trained_on_is_not_held_out_when_the_window_moves_on(data, monkeypatch):
+    monkeypatch.setattr("sb3_rpto.dynamics.residual.MAX_TRANSITIONS", 150)
+    dynamics, masks = make(), []
+    mask = dynamics.ensemble.holdout_mask
+
+    def watched(rows):
+        held = mask(rows)
+        masks.append(({*rows[held].tolist()}, {*rows[~held].tolist()}))
+        return held
+
+    monkeypatch.setattr(dynamics.ensemble, "holdout_mask", watched)
+    for n in (300, 330, 365):
+        dynamics.fit(data.take(slice(n)), max_steps=1)
+    assert len(masks) == 3
+    for (_, trained), (held, _) in pairwise(masks):
+        assert held
+        assert not held & trained
 
 
 def test_weights_of_another_shape_are_refused(data):
