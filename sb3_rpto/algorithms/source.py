@@ -24,7 +24,7 @@ from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
 from sb3_rpto.effects import Effect
 from sb3_rpto.effects.stance import StandingEnv
-from sb3_rpto.envs.copies import copy_env
+from sb3_rpto.envs.copies import must_copy
 from sb3_rpto.envs.state import reseed, restore_state, save_state, whereabouts
 
 RolloutStart = Literal["target", "source", "mix"]
@@ -266,12 +266,13 @@ def copied(env: VecEnv) -> gym.Env:
 
     :raises ValueError: it cannot be copied
     """
-    copy = copy_env(env)
-    if copy is None:
+    try:
+        return must_copy(env)
+    except Exception as error:  # whatever the contents of a user's environment raise
         raise ValueError(
-            f"env {env} cannot be copied, which dynamics='physical' needs; give it a DummyVecEnv of gym.make"
-        )
-    return copy
+            f"env {env} cannot be copied ({error}), which dynamics='physical' needs; give it a DummyVecEnv of gym.make "
+            "whose environment holds nothing that copy.deepcopy refuses"
+        ) from error
 
 
 class BranchSource(SourceWorld):

@@ -20,7 +20,7 @@ from sb3_rpto.envs.observations import (
     state_map,
     strange_wrapper,
 )
-from sb3_rpto.envs.steps import odd_memory, odd_state, odd_step
+from sb3_rpto.envs.steps import drawn_numbers, odd_memory, odd_state, odd_step
 
 
 def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
@@ -59,6 +59,12 @@ def check_source(env: gym.Env | VecEnv) -> StateMap:
     frame_skip = getattr(single.unwrapped, "frame_skip", None)
     if frame_skip is None:
         raise ValueError(f"{env_name(single)} has no frame_skip; derive it from gymnasium.envs.mujoco.MujocoEnv")
+    drawn = drawn_numbers(single)
+    if drawn:
+        raise ValueError(
+            f"{env_name(single)}: reset() draws {', '.join(drawn[:3])}, and what it writes undoes phi; let its model "
+            "stay, and give dynamics_kwargs={'randomise': 1.0} for episodes that differ"
+        )
     check_step(single, int(frame_skip))
     check_states(single, recover)
     return recover

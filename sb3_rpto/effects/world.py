@@ -58,6 +58,10 @@ class World(ABC):
             self._nominal[name] = self._live(name)[:1].copy()
         return self._live(name)
 
+    def written(self) -> dict[str, np.ndarray]:
+        """Copies of the fields that were ever written, by name, (n, ...) each."""
+        return {name: self._live(name).copy() for name in self._nominal}
+
     def restore(self) -> None:
         """Give every field that was written its nominal values again."""
         for name, values in self._nominal.items():

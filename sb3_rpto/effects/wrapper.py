@@ -169,9 +169,19 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         return any(layer._sensing for layer in corrections(self))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; commands from before it are forgotten."""
+        """Start an episode; commands from before it are forgotten.
+
+        :raises ValueError: the environment's own reset writes numbers of the model that these effects have set
+        """
         self._begin_anew()
+        before = self._world.written()
         begun = self.env.reset(seed=seed, options=options)
+        lost = [name for name, values in self._world.written().items() if not np.array_equal(values, before[name])]
+        if lost:
+            raise ValueError(
+                f"reset() of {type(self.unwrapped).__name__} writes {', '.join(lost)} of its model, which the effects "
+                "have set; let it leave them as they are"
+            )
         self._time = float(self.unwrapped.data.time)  # type: ignore[attr-defined]
         return begun
 

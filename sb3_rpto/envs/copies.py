@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import re
 import types
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -18,6 +19,8 @@ from sb3_rpto.envs.observations import layers
 
 #: Wrappers that only draw or film.
 _DRAWING = (wrappers.RecordVideo, wrappers.HumanRendering, wrappers.RenderCollection)
+#: MuJoCo's named views: of which structure, and of which kind of object.
+_VIEWS = re.compile(r"_(MjData|MjModel)(\w+)Views")
 #: Collections of more things hold numbers, not views of a simulation.
 _LARGE = 1000
 
@@ -33,13 +36,21 @@ def copy_env(env: gym.Env | VecEnv) -> gym.Env | None:
     :param env: the environment, untouched
     :return: the copy, or None when it cannot be made (subprocesses, contents that do not copy)
     """
-    base = env if isinstance(env, gym.Env) else env.unwrapped
-    if not isinstance(base, gym.Env | DummyVecEnv):
-        return None
     try:
-        return _clone(base if isinstance(base, gym.Env) else base.envs[0], {})
+        return must_copy(env)
     except Exception:  # whatever the contents of a user's environment raise when copied
         return None
+
+
+def must_copy(env: gym.Env | VecEnv) -> gym.Env:
+    """As :func:`copy_env`.
+
+    :raises Exception: what stands in the way, of any kind
+    """
+    base = env if isinstance(env, gym.Env) else env.unwrapped
+    if not isinstance(base, gym.Env | DummyVecEnv):
+        raise TypeError(f"{type(base).__name__} keeps its environments elsewhere")
+    return _clone(base if isinstance(base, gym.Env) else base.envs[0], {})
 
 
 def _clone(env: gym.Env, memo: dict[int, Any]) -> gym.Env:
@@ -50,11 +61,14 @@ def _clone(env: gym.Env, memo: dict[int, Any]) -> gym.Env:
     for layer in reversed(layers(env)):
         inner = memo.setdefault(id(layer), inner)  # in the place of one that draws is what it wraps
     # The innermost first, as it has the model of its data.
-    fields = [pair for layer in reversed(kept) for pair in _cloned_simulation(layer, memo)]
+    simulations = [pair for layer in reversed(kept) for pair in _cloned_simulation(layer, memo)]
+    fields = [pair for one, twin in simulations for pair in _numbers(one, twin)]
     things = list(_reachable([vars(layer) for layer in kept]))
     for thing in things:
         if isinstance(thing, np.ndarray) and thing.base is not None:
             _follow(thing, fields, memo)
+        elif _VIEWS.fullmatch(type(thing).__name__):
+            _look_up(thing, simulations, memo)
     for thing in things:
         if isinstance(thing, types.FunctionType):
             _twin_of(thing, memo)
@@ -81,8 +95,8 @@ def _is_handle(value: Any) -> bool:
     return isinstance(value, ResultsWriter) or module.startswith(("pygame", "gymnasium.envs.mujoco.mujoco_rendering"))
 
 
-def _cloned_simulation(layer: gym.Env, memo: dict[int, Any]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Let ``memo`` have a copy of the layer's ``MjData`` that steps a copy of its model; their numbers and its."""
+def _cloned_simulation(layer: gym.Env, memo: dict[int, Any]) -> Iterator[tuple[Any, Any]]:
+    """Let ``memo`` have a copy of the layer's ``MjData`` that steps a copy of its model; both with their copies."""
     for data in vars(layer).values():
         if type(data).__name__ != "MjData" or id(data) in memo:
             continue
@@ -91,11 +105,15 @@ def _cloned_simulation(layer: gym.Env, memo: dict[int, Any]) -> Iterator[tuple[n
         model = vars(layer)["model"]
         memo[id(data)] = mujoco.MjData(copy.deepcopy(model, memo))
         mujoco.mj_copyData(memo[id(data)], memo[id(model)], data)
-        for one, twin in ((data, memo[id(data)]), (model, memo[id(model)])):
-            for name in dir(one):
-                field = None if name.startswith("_") else getattr(one, name, None)
-                if isinstance(field, np.ndarray) and field.size:
-                    yield field, getattr(twin, name)
+        yield from ((data, memo[id(data)]), (model, memo[id(model)]))
+
+
+def _numbers(one: Any, twin: Any) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The arrays of what holds some by name, each with that of its copy."""
+    for name in dir(one):
+        field = None if name.startswith("_") else getattr(one, name, None)
+        if isinstance(field, np.ndarray) and field.size:
+            yield field, getattr(twin, name)
 
 
 def _reachable(values: list[Any]) -> Iterator[Any]:
@@ -134,6 +152,17 @@ def _follow(array: np.ndarray, fields: Sequence[tuple[np.ndarray, np.ndarray]], 
             start = array.__array_interface__["data"][0] - field.__array_interface__["data"][0]
             memo[id(array)] = np.ndarray(array.shape, array.dtype, twin.reshape(-1), start, array.strides)
             return
+
+
+def _look_up(view: Any, simulations: Sequence[tuple[Any, Any]], memo: dict[int, Any]) -> None:
+    """Let the copy of ``data.joint("elbow")``, or of another named view, be that of its simulation's copy."""
+    of, what = _VIEWS.fullmatch(type(view).__name__).groups()  # type: ignore[union-attr]
+    for one, twin in simulations:
+        if type(one).__name__ == of:
+            same, found = (getattr(side, what.lower())(view.id) for side in (one, twin))
+            if any(np.may_share_memory(field, mine) for field, mine in _numbers(view, same)):
+                memo[id(view)] = found
+                return
 
 
 def _twin_of(value: Any, memo: dict[int, Any]) -> Any:

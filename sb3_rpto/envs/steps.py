@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from itertools import pairwise
 from typing import Any
 
 import gymnasium as gym
@@ -10,11 +12,12 @@ import numpy as np
 
 from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.engine import quiet
+from sb3_rpto.effects.model import differing
 from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import StateMap
 
-#: Episodes whose first step is compared with MuJoCo alone.
-TRIED = 3
+#: Episodes, and steps of each, that are compared with MuJoCo alone: what remembers shows after the first.
+TRIED, FOLLOWED = 3, 8
 #: All that a simulation of transitions starts from. What else a reset sets, a mocap body say, it does not know.
 KNOWN = ("qpos", "qvel", "act", "history", "qacc_warmstart")
 #: Episodes and steps of each whose states are compared with what the observations are said to show.
@@ -24,6 +27,10 @@ SHOWN, STEPS = 3, 10
 EPISODES, BEYOND = 8, 3.0
 #: A coordinate is wrong where it is off by more than this share of how far the coordinate moves, and by this much.
 OFF, LEAST = 0.5, 1e-3
+#: It is wrong, too, where its zero is off by more than this share, or its scale, and by more than noise lets them.
+SYSTEMATIC = 0.05
+#: Fields that say where things are, or how they look.
+PLACES = re.compile(r"(body|geom|site|cam|light)_(pos|quat|rgba|dir|poscom0|pos0|mat0)|(mat|tex|vis|stat)[._].*")
 
 
 def odd_step(env: gym.Env, frame_skip: int) -> str | None:
@@ -40,17 +47,20 @@ def odd_step(env: gym.Env, frame_skip: int) -> str | None:
     base: Any = twin.unwrapped
     twin.action_space.seed(0)
     low, high = command_limits(base.model)
-    for seed in range(TRIED):
-        twin.reset(seed=seed)
+    over = False
+    for step in range(TRIED * FOLLOWED):
+        if step % FOLLOWED == 0 or over:
+            twin.reset(seed=step)
         action = twin.action_space.sample()
         commands = np.clip(action, low, high)
         alone = mujoco.MjData(base.model)
         for name in KNOWN:
             getattr(alone, name)[:] = getattr(base.data, name)
+        alone.time = base.data.time
         alone.ctrl[:] = commands
         with quiet():
             mujoco.mj_step(base.model, alone, nstep=frame_skip)
-            twin.step(action)
+            over = any(twin.step(action)[2:4])
         if not np.allclose(np.clip(base.data.ctrl, low, high), commands):
             return f"gives the commands {base.data.ctrl} where the action is {action}"
         if not (np.allclose(base.data.qpos, alone.qpos) and np.allclose(base.data.qvel, alone.qvel)):
@@ -59,6 +69,25 @@ def odd_step(env: gym.Env, frame_skip: int) -> str | None:
                 "bodies or constraints that step() or reset() sets beside them?)"
             )
     return None
+
+
+def drawn_numbers(env: gym.Env) -> list[str]:
+    """Numbers of the model that a reset draws, but for where things are and how they look: those are goals.
+
+    Nothing is found where the environment cannot be copied.
+
+    :param env: a MuJoCo environment; untouched
+    """
+    twin = copy_env(env)
+    if twin is None:
+        return []
+    model: mujoco.MjModel = twin.unwrapped.model  # type: ignore[attr-defined]
+    drawn = list[mujoco.MjModel]()
+    for seed in range(TRIED):
+        twin.reset(seed=seed)
+        drawn.append(model.__copy__())
+    found = {name for one, other in pairwise(drawn) for name in differing(one, other)}
+    return sorted(name for name in found if not PLACES.fullmatch(name))
 
 
 def odd_state(env: gym.Env, recover: StateMap) -> str | None:
@@ -88,17 +117,33 @@ def odd_state(env: gym.Env, recover: StateMap) -> str | None:
     off = np.concatenate([shown.qpos, shown.qvel], axis=1) - true
     turns = list(shown.wrapped)
     off[:, turns] = (off[:, turns] + np.pi) % (2 * np.pi) - np.pi
-    off[~np.concatenate([shown.known_qpos, shown.known_qvel], axis=1)] = 0.0
-    wrong = np.sqrt((off**2).mean(axis=0)) > np.maximum(OFF * true.std(axis=0), LEAST)
-    if not wrong.any():
+    known = np.concatenate([shown.known_qpos, shown.known_qvel], axis=1)
+    wrong = [column for column in range(true.shape[1]) if _is_off(*(x[known[:, column], column] for x in (off, true)))]
+    if not wrong:
         return None
-    column = int(np.flatnonzero(wrong)[0])
+    column = wrong[0]
+    off = np.where(known, off, 0.0)
     nq = base.model.nq
     name = f"qpos[{column}]" if column < nq else f"qvel[{column - nq}]"
     row = int(np.abs(off[:, column]).argmax())
     return (
         f"{name} is {true[row, column]:.4g} where the observation is read as {true[row, column] + off[row, column]:.4g}"
     )
+
+
+def _is_off(off: np.ndarray, true: np.ndarray) -> bool:
+    """Whether a coordinate is read as another one, or by another zero or scale: noise has neither.
+
+    :param off: what it is read as too much, (n,)
+    :param true: what it is, (n,)
+    """
+    if len(off) == 0:
+        return False
+    moved, spread = true - true.mean(), float(true.std())
+    scale = float(off @ moved) / max(float(moved @ moved), 1e-12)
+    noise = 4 * float(np.std(off - off.mean() - scale * moved)) / np.sqrt(len(off))
+    by = max(float(abs(off.mean())), abs(scale) * spread)
+    return by > max(LEAST, SYSTEMATIC * spread, noise) or bool(np.sqrt((off**2).mean()) > max(OFF * spread, LEAST))
 
 
 def odd_memory(env: gym.Env, recover: StateMap) -> str | None:

@@ -21,6 +21,8 @@ from sb3_rpto import RPO, RPTO
 from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.factory import preset_section
 from sb3_rpto.dynamics.simulator import physical_config
+from sb3_rpto.effects import declare
+from sb3_rpto.envs.corrected import apply_effects
 
 POLE = "InvertedPendulum-v5"
 #: Falls beyond this many rad end an episode.
@@ -113,6 +115,30 @@ class Pushed(InvertedPendulumEnv):
         return super().step(action)
 
 
+class Smoothed(InvertedPendulumEnv):
+    """Its filter begins at an episode's first action."""
+
+    def step(self, action: np.ndarray) -> Any:
+        self.sent = np.asarray(action) if self.sent is None else 0.7 * self.sent + 0.3 * np.asarray(action)
+        return super().step(self.sent)
+
+    def reset_model(self) -> Any:
+        self.sent: Any = None
+        return super().reset_model()
+
+
+class Dragged(InvertedPendulumEnv):
+    """Begins at rest, where nothing drags."""
+
+    def step(self, action: np.ndarray) -> Any:
+        self.data.qfrc_applied[0] = -3.0 * self.data.qvel[0]
+        return super().step(action)
+
+    def reset_model(self) -> Any:
+        self.set_state(self.init_qpos, self.init_qvel)
+        return self._get_obs()
+
+
 class Leaning(InvertedPendulumEnv):
     """What its reset sets stays, and is in no position or velocity."""
 
@@ -121,9 +147,40 @@ class Leaning(InvertedPendulumEnv):
         return super().reset_model()
 
 
+class Drawing(InvertedPendulumEnv):
+    """Another machine in each episode, or another place of what is drawn."""
+
+    def __init__(self, numbers: str) -> None:
+        self.numbers = numbers
+        super().__init__()
+
+    def reset_model(self) -> Any:
+        getattr(self.model, self.numbers)[2] = self.np_random.uniform(4, 6)
+        return super().reset_model()
+
+
+def test_a_reset_that_draws_the_machine_is_refused_and_one_that_places_something_is_not() -> None:
+    with pytest.raises(ValueError, match=r"reset\(\) draws body_mass.*'randomise': 1.0"):
+        simulated(gym.wrappers.TimeLimit(Drawing("body_mass"), 1_000))
+    simulated(gym.wrappers.TimeLimit(Drawing("geom_rgba"), 1_000))
+
+
+def test_a_reset_that_undoes_an_effect_is_told() -> None:
+    heavy = declare(Drawing("body_mass").model, ["pole.mass=1:20"])[0].with_values(np.array([9.0]))
+    env = apply_effects(Drawing("body_mass"), [heavy])
+    with pytest.raises(ValueError, match=r"reset\(\) of Drawing writes body_mass of its model"):
+        env.reset(seed=0)
+
+
 @pytest.mark.parametrize(
     ("made_by", "message"),
-    [(Scaled, "gives the commands"), (Pushed, "moves otherwise"), (Leaning, "moves otherwise")],
+    [
+        (Scaled, "gives the commands"),
+        (Smoothed, "gives the commands"),
+        (Pushed, "moves otherwise"),
+        (Leaning, "moves otherwise"),
+        (Dragged, "moves otherwise"),
+    ],
 )
 def test_a_step_that_is_more_than_its_simulation_is_refused(made_by: type[gym.Env], message: str) -> None:
     with pytest.raises(ValueError, match=rf"step\(\) {message}.*phi would make up for"):

@@ -630,6 +630,37 @@ def test_observations_that_are_noisier_than_resets_are_no_goal(noise):
     check_memoryless(env, state_map(gym.make(HOPPER)))
 
 
+class Tracking(InvertedPendulumEnv):
+    """Its observations are told by a map of its own."""
+
+
+@pytest.mark.parametrize(
+    ("scales", "shift", "noise", "refused"),
+    [
+        ((1, 1), 0.0, 0.0, False),
+        ((1, 1), 0.0, 0.01, False),
+        ((1.2, 1), 0.0, 0.0, True),
+        ((1, 0.8), 0.0, 0.0, True),
+        ((1, 1.4), 0.0, 0.001, True),
+        ((1, 1), 0.005, 0.0, True),
+    ],
+)
+def test_a_map_of_another_scale_or_zero_is_refused_and_one_of_noise_is_not(scales, shift, noise, refused):
+    rng = np.random.default_rng(0)
+
+    def recover(obs):
+        known = np.ones((len(obs), 2), dtype=bool)
+        qpos = scales[0] * obs[:, :2] + [0.0, shift] + noise * rng.standard_normal((len(obs), 2))
+        return States(qpos, scales[1] * obs[:, 2:4], known, known)
+
+    register_state_map(Tracking, lambda env: recover)
+    if refused:
+        with pytest.raises(ValueError, match=r"where the observation is read as .*; correct the map"):
+            physical_config(Tracking())
+    else:
+        physical_config(Tracking())
+
+
 def test_steps_do_not_touch_the_environment_they_were_given():
     env = gym.make(POLE)
     env.reset(seed=0)

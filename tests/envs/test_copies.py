@@ -5,12 +5,15 @@ from __future__ import annotations
 import functools
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_rpto.algorithms.source import copied
 from sb3_rpto.effects import LIBRARY
-from sb3_rpto.envs.copies import copy_env
+from sb3_rpto.envs.copies import copy_env, must_copy
 from sb3_rpto.envs.corrected import apply_effects
 
 
@@ -107,6 +110,21 @@ class Named(Tilting):
         return lambda: self.hinge.qpos[0]
 
 
+class NamedBeside(Tilting):
+    """There is another simulation, too."""
+
+    def looking(self):
+        self.other = mujoco.MjData(self.model)
+        self.hinges = {"other": self.other.joint("hinge"), "own": self.data.joint(1)}
+        return lambda: self.hinges["own"].qpos[0] + self.hinges["other"].qpos[0]
+
+
+class Opaque(Tilting):
+    def looking(self):
+        self.numbers = iter(x for x in [1.0])
+        return lambda: self.data.qpos[1]
+
+
 WORLDS = [
     Helper,
     View,
@@ -115,6 +133,8 @@ WORLDS = [
     HeldByAFunction,
     Default,
     Partial,
+    Named,
+    NamedBeside,
     lambda: Watching(gym.make("InvertedPendulum-v5").unwrapped),
 ]
 
@@ -156,5 +176,18 @@ def test_a_corrected_environment_ends_and_rewards_by_its_own_simulation() -> Non
     assert rows != episode(Helper())
 
 
-def test_what_mujoco_names_is_not_copied() -> None:
-    assert copy_env(Named()) is None
+def test_the_copy_of_what_mujoco_names_is_of_the_copied_model() -> None:
+    env = InvertedPendulumEnv()
+    env.cart = env.model.body("cart")
+    copy = copy_env(env)
+    copy.cart.mass[0] = 3.0
+    assert copy.model.body("cart").mass[0] == 3.0
+    assert env.model.body("cart").mass[0] != 3.0
+
+
+def test_what_does_not_copy_is_named() -> None:
+    assert copy_env(Opaque()) is None
+    with pytest.raises(TypeError, match="generator"):
+        must_copy(Opaque())
+    with pytest.raises(ValueError, match=r"cannot be copied \(.*generator.*whose environment holds nothing that"):
+        copied(DummyVecEnv([Opaque]))
