@@ -114,7 +114,7 @@ def motor_torque(world: World, actuator: int, dof: int, adr: int) -> np.ndarray:
     if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
         force = force + _affine(world.field("actuator_biasprm")[:, actuator], length, speed)
     if model.actuator_forcelimited[actuator]:
-        limits = world.field("actuator_forcerange")[:, actuator]
+        limits = world.force_range(actuator)
         force = np.clip(force, limits[:, 0], limits[:, 1])
     return gear * force
 
@@ -129,19 +129,19 @@ def joint_torque(world: World, actuators: list[int] | None, dof: int, adr: int) 
     return _through(world, _sum(world, actuators, dof, adr) - world.loss[:, dof], dof)
 
 
-def joint_loss(world: World, actuators: list[int], dof: int, adr: int, loss: np.ndarray) -> np.ndarray:
-    """What a joint loses, (n,), where its actuators' sum is less by ``loss``: nothing of what its limit takes anyway.
+def count_loss(world: World, actuators: list[int], dof: int, adr: int, loss: np.ndarray) -> None:
+    """Count as lost in this substep (``world.loss``, (n,)) what one of a joint's actuators does not give.
 
-    It counts as lost in this substep from then on (``world.loss``).
+    The joint misses it (``world.missed``), but for what its limit takes anyway.
 
     :param actuators: all that act on the joint
     """
     before = world.loss[:, dof].copy()
     world.loss[:, dof] += loss
-    if not world.model.jnt_actfrclimited[world.model.dof_jntid[dof]]:
-        return loss
-    total = _sum(world, actuators, dof, adr) - before
-    return _through(world, total, dof) - _through(world, total - loss, dof)
+    if world.model.jnt_actfrclimited[world.model.dof_jntid[dof]]:
+        total = _sum(world, actuators, dof, adr) - before
+        loss = _through(world, total, dof) - _through(world, total - loss, dof)
+    world.missed[:, dof] += loss
 
 
 def _sum(world: World, actuators: list[int], dof: int, adr: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.actuation import joint_loss, memoryless, motor_torque, motors
+from sb3_rpto.effects.actuation import count_loss, memoryless, motor_torque, motors
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.names import SCALAR_JOINTS, hinges, object_names
 from sb3_rpto.effects.world import World, add
@@ -167,8 +167,11 @@ class DCMotor(Effect):
         """Take away what the motor cannot give."""
         torque = motor_torque(world, self.index, self.dof, self.adr)
         speed = world.qvel[:, self.dof]
-        driving = np.where(torque * speed > 0, np.abs(speed), 0.0)
-        room = np.maximum(1 - x[:, 1] * driving, 0.0)
-        limit = np.divide(room, x[:, 0], out=np.where(room > 0, np.inf, 0.0), where=x[:, 0] > 0)
-        loss = torque - np.clip(torque, -limit, limit)
-        world.force[:, self.dof] -= joint_loss(world, self.beside, self.dof, self.adr, loss)
+        room = np.maximum(1 - x[:, 1:] * np.maximum(np.stack([-speed, speed], axis=1), 0.0), 0.0)
+        most = np.divide(room, x[:, :1], out=np.where(room > 0, np.inf, 0.0), where=x[:, :1] > 0)
+        limits = most * [-1, 1]  # of the torque that pulls the joint back, and of that which drives it on
+        count_loss(world, self.beside, self.dof, self.adr, torque - np.clip(torque, limits[:, 0], limits[:, 1]))
+        gear = world.field("actuator_gear")[:, self.index, :1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = np.sort(np.where(gear == 0, [-np.inf, np.inf], limits / gear), axis=1)
+        world.room[:, self.index] = np.clip(ends, world.room[:, self.index, :1], world.room[:, self.index, 1:])

@@ -15,11 +15,26 @@ def _along(x: np.ndarray, q: np.ndarray) -> np.ndarray:
     return x.reshape(x.shape + (1,) * (q.ndim - x.ndim))
 
 
-def readers(sensor: Effect, model: mujoco.MjModel) -> np.ndarray:
-    """The actuators that feed back the sensor's position, kp (u - q) for one, with gear g kp (u - g q)."""
-    there = np.isin(model.actuator_trntype, JOINTS) & (model.actuator_trnid[:, 0] == sensor.index)
+def readers(sensor: Effect, model: mujoco.MjModel) -> dict[int, float]:
+    """The actuators that feed back the sensor's position, kp (u - q) for one, with gear g kp (u - g q).
+
+    :return: how much of the position their length has, without gear: all, or a fixed tendon's coefficient
+    """
     feedback = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (model.actuator_biasprm[:, 1] != 0)
-    return np.flatnonzero(there & feedback)
+    lengths = {int(a): _lengths(model, int(a)).get(sensor.index, 0.0) for a in np.flatnonzero(feedback)}
+    return {a: share for a, share in lengths.items() if share}
+
+
+def _lengths(model: mujoco.MjModel, actuator: int) -> dict[int, float]:
+    """The joints whose positions an actuator's length sums, each with its factor; none of other kinds of length."""
+    on = int(model.actuator_trnid[actuator, 0])
+    if model.actuator_trntype[actuator] in JOINTS:
+        return {on: 1.0}
+    wraps = range(model.tendon_adr[on], model.tendon_adr[on] + model.tendon_num[on]) if model.ntendon else range(0)
+    fixed = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_TENDON and all(
+        model.wrap_type[i] == mujoco.mjtWrap.mjWRAP_JOINT for i in wraps
+    )
+    return {int(model.wrap_objid[i]): float(model.wrap_prm[i]) for i in wraps} if fixed else {}
 
 
 def ago(steps: np.ndarray, q: np.ndarray, v: np.ndarray) -> Pair:
@@ -61,8 +76,8 @@ class SensorDelay(Effect):
 class SensorBias(Effect):
     """An encoder whose zero is wrong: it shows :math:`q + b`; the speed is right.
 
-    The joint offset of a robot's geometric calibration (Khalil & Dombre 2002). A position servo on the joint regulates
-    what it shows, :math:`k_p (u - q - b)`.
+    The joint offset of a robot's geometric calibration (Khalil & Dombre 2002). A position servo on the joint, or on a
+    fixed tendon with it, regulates what it shows, :math:`k_p (u - q - b)`.
     """
 
     kind = "sensor_bias"
@@ -81,17 +96,18 @@ class SensorBias(Effect):
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Feed back what is shown."""
-        for i in readers(self, world.model):
+        for i, share in readers(self, world.model).items():
             bias, gear = world.field("actuator_biasprm"), world.field("actuator_gear")
-            bias[:, i, 0] += bias[:, i, 1] * gear[:, i, 0] * x[:, 0]
+            bias[:, i, 0] += bias[:, i, 1] * gear[:, i, 0] * share * x[:, 0]
 
 
 @register
 class SensorGain(Effect):
     r"""A wrong scale of an encoder or potentiometer: it shows :math:`(1 + g)\,q` and :math:`(1 + g)\,\dot q`.
 
-    The joint transducers' part of a robot's calibration (Mooring, Roth & Driels 1991). A position servo on the joint
-    regulates what it shows, :math:`k_p (u - (1 + g) q)`; feedback of the speed may be back-EMF, and stays.
+    The joint transducers' part of a robot's calibration (Mooring, Roth & Driels 1991). A position servo on the joint,
+    or on a fixed tendon of it alone, regulates what it shows, :math:`k_p (u - (1 + g) q)`; feedback of the speed may
+    be back-EMF, and stays. One on a tendon of several joints regulates the true length.
     """
 
     kind = "sensor_gain"
@@ -112,5 +128,6 @@ class SensorGain(Effect):
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Feed back what is shown."""
-        for i in readers(self, world.model):
+        alone = [i for i in readers(self, world.model) if len(_lengths(world.model, i)) == 1]
+        for i in alone:
             world.field("actuator_biasprm")[:, i, 1] *= 1 + x[:, 0]

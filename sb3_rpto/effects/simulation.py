@@ -285,7 +285,7 @@ class Push:
 
 def collect(world: World, acting: Active) -> None:
     """Collect the forces of one substep."""
-    world.force[:], world.pull[:], world.friction[:], world.loss[:] = 0, 0, 0, 0
+    world.forget()
     if any(effect.asks_simulator for effect, _ in acting):
         world.evaluate()
     for effect, x in acting:

@@ -12,6 +12,10 @@ from sb3_rpto.cores import cores
 _DERIVING = frozenset(mujoco.MjModel._setconst_inputs)
 
 
+#: A force range that limits nothing; MuJoCo's own largest number.
+UNLIMITED = 1e10
+
+
 def add(numbers: np.ndarray, amounts: np.ndarray) -> None:
     """Add, in place, to numbers of a model that are never negative; negative amounts take away, at most all."""
     numbers[:] = np.maximum(numbers + amounts, 0.0)
@@ -41,9 +45,24 @@ class World(ABC):
         self.pull = np.zeros((n, model.nbody, 3))  # N, at the bodies' centres of mass, in the world's frame
         self.pulls = False  # whether there was any since settle
         self.loss = np.zeros((n, model.nv))  # N·m or N, what motors do not give of their torques
+        self.missed = np.zeros((n, model.nv))  # N·m or N, what reaches the joints less for it
+        self.room = np.zeros((n, model.nu, 2))  # lowest and highest force of the actuators, in their units
         self._nominal: dict[str, np.ndarray] = {}
         self._base_friction: np.ndarray | None = None  # (n, nv), before the substep's own
         self._dry = np.zeros(model.nv, dtype=bool)  # joints whose friction has varied since settle
+        self._base_range: np.ndarray | None = None  # (n, nu, 2), before the substep's own
+        self._tight = np.zeros(model.nu, dtype=bool)  # actuators whose force was limited since settle
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing acts in the substep to come, until effects say so."""
+        self.force[:], self.pull[:], self.friction[:], self.loss[:], self.missed[:] = 0, 0, 0, 0, 0
+        self.room[:] = -np.inf, np.inf
+
+    def force_range(self, actuator: int) -> np.ndarray:
+        """What the model, without :attr:`room`, lets an actuator give, (n, 2)."""
+        ranges = self.field("actuator_forcerange") if self._base_range is None else self._base_range
+        return ranges[:, actuator]
 
     @abstractmethod
     def _live(self, name: str) -> np.ndarray:
@@ -75,8 +94,8 @@ class World(ABC):
 
     def _begin_to_act(self) -> None:
         """No effect has acted yet: keep the level of dry friction before one does."""
-        self._dry[:] = self.pulls = False
-        self._base_friction = None
+        self._dry[:] = self._tight[:] = self.pulls = False
+        self._base_friction = self._base_range = None
         if "dof_frictionloss" in self._nominal:
             self._base_friction = self._live("dof_frictionloss").copy()
 
@@ -98,7 +117,7 @@ class World(ABC):
             self.field("dof_solimp")[where, dof] = (0.99, 0.99, 0.001, 0.5, 2.0)
 
     def commit(self) -> None:
-        """Write the collected ``force``, ``pull`` and ``friction`` to the physics."""
+        """Write the collected ``force``, ``pull``, ``friction`` and ``room`` to the physics."""
         self._applied()[:] = self.force
         if self.pulls or self.pull.any():
             self.pulls = True
@@ -112,6 +131,17 @@ class World(ABC):
             self._dry |= dry
         if self._dry.any() and self._base_friction is not None:
             np.maximum(self._base_friction + self.friction, 0.0, out=self._live("dof_frictionloss"))
+
+        tight = np.isfinite(self.room).any(axis=(0, 2))
+        if tight.any() and self._base_range is None:
+            self._base_range = self.field("actuator_forcerange").copy()
+            self._base_range[:, ~self.model.actuator_forcelimited.astype(bool)] = -UNLIMITED, UNLIMITED
+        self._tight |= tight
+        if self._base_range is not None:
+            # MuJoCo's own limit: what feeds back the speed within a step sees it, as a force beside it would not.
+            low, high = np.split(self._base_range[:, self._tight], 2, axis=2)
+            self.field("actuator_forcelimited")[:, self._tight] = True
+            self.field("actuator_forcerange")[:, self._tight] = np.clip(self.room[:, self._tight], low, high)
 
     @abstractmethod
     def evaluate(self) -> None:

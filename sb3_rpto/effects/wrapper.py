@@ -155,7 +155,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         model = self._world.model
         beneath = [effect for layer in corrections(self)[1:] for effect, _ in layer._sensing]
         for effect, _ in active(effects):
-            fed_back = effect.senses and effect.overrides("write") and readers(effect, model).size
+            fed_back = effect.senses and effect.overrides("write") and readers(effect, model)
             others = [x for x in beneath if x.on == effect.on and x.overrides("write")] if fed_back else []
             if any(isinstance(x, SensorGain) for other in others for x in (effect, other)):
                 raise ValueError(

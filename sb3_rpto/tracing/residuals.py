@@ -171,7 +171,7 @@ def _forces(
             world.qpos[:], world.qvel[:] = qpos[t], qvel[t]
             world.ctrl[:] = around[t]
             collect(world, acting)
-            known[t] = world.force[0]
+            known[t] = world.force[0] - world.missed[0]
             for body in np.flatnonzero(world.pull[0].any(axis=1)):
                 mujoco.mj_applyFT(model, mj, world.pull[0, body], np.zeros(3), mj.xipos[body], int(body), known[t])
             level = level + world.friction[0]

@@ -11,6 +11,8 @@ from scipy.optimize import least_squares
 
 from sb3_rpto.effects import LIBRARY, Drive, Effect, Scales, Simulation, from_json
 from sb3_rpto.effects.sensors import ago
+from sb3_rpto.effects.simulation import prepare
+from sb3_rpto.effects.world import BatchWorld
 
 ARM = mujoco.MjModel.from_xml_string("""
 <mujoco>
@@ -425,11 +427,16 @@ def test_gain_sits_where_the_force_is_linear_in_it() -> None:
     assert LIBRARY["command_gain"].places(model) == ["plain", "affine"]
 
 
-def test_a_motors_limit_is_its_forcerange_whatever_its_joint_lets_through() -> None:
-    text = """<mujoco><option timestep="0.002"/><worldbody><body><joint name="j" axis="0 1 0" actuatorfrcrange="-5 4"/>
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+@pytest.mark.parametrize("gear", [1, -2])
+def test_a_motors_limit_is_its_forcerange_whatever_its_joint_lets_through(integrator: str, gear: int) -> None:
+    text = """<mujoco><option timestep="0.002" integrator="INT"/><worldbody><body>
+    <joint name="j" axis="0 1 0" actuatorfrcrange="-5 4"/>
     <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="1"/></body></worldbody><actuator>
-    <position name="a" joint="j" kp="200" kv="1" %s/><motor joint="j" gear="3"/></actuator></mujoco>"""
-    limited, model = (mujoco.MjModel.from_xml_string(text % s) for s in ('forcerange="-6 6"', ""))
+    <position name="a" joint="j" kp="200" kv="8" gear="GEAR" %s/><motor joint="j" gear="3"/></actuator></mujoco>"""
+    text = text.replace("INT", integrator).replace("GEAR", str(gear))
+    ends = f'forcerange="-{6 / abs(gear)} {6 / abs(gear)}"'
+    limited, model = (mujoco.MjModel.from_xml_string(text % s) for s in (ends, ""))
     commands = 2 * np.sin(np.arange(300) / 20)[None, :, None] * np.array([1.0, -0.7])
     found = []
     for one, effects in ((limited, []), (model, [LIBRARY["dc_motor"]("a", inverse_stall=1 / 6)]), (model, [])):
@@ -437,6 +444,29 @@ def test_a_motors_limit_is_its_forcerange_whatever_its_joint_lets_through() -> N
         found.append(sim.rollout(sim.values()[None], np.zeros((1, 1)), np.zeros((1, 1)), Drive(commands))[0])
     np.testing.assert_allclose(found[1], found[0], atol=1e-9)
     assert np.abs(found[2] - found[0]).max() > 0.01
+
+
+def test_a_servo_on_a_tendon_regulates_what_its_joints_sensors_show() -> None:
+    text = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="j" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/><body pos=".3 0 0"><joint name="k" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/></body></body></worldbody>
+    <tendon><fixed name="one"><joint joint="j" coef="2"/></fixed>
+    <fixed name="both"><joint joint="j" coef="1"/><joint joint="k" coef="-1"/></fixed></tendon><actuator>
+    <position tendon="%s" kp="50" gear="1.5"/></actuator></mujoco>"""
+
+    def biases(tendon: str, *effects: Effect) -> list[float]:
+        model = mujoco.MjModel.from_xml_string(text % tendon)
+        world = BatchWorld(model, 1, 1)
+        sim = Simulation(model, list(effects), 1)
+        prepare(world, sim.active(sim.values()[None]))
+        return world.batch.get_model(0).actuator_biasprm[0, :2].tolist()
+
+    offset, gain = LIBRARY["sensor_bias"], LIBRARY["sensor_gain"]
+    assert biases("one", offset("j", offset=0.1)) == pytest.approx([-50 * 1.5 * 2 * 0.1, -50])
+    assert biases("both", offset("k", offset=0.1)) == pytest.approx([50 * 1.5 * 0.1, -50])
+    assert biases("one", offset("k", offset=0.1)) == pytest.approx([0, -50])
+    assert biases("one", gain("j", change=0.2)) == pytest.approx([0, -60])
+    assert biases("both", gain("j", change=0.2)) == pytest.approx([0, -50])
 
 
 def test_lag_is_the_mean_of_filterexact() -> None:
