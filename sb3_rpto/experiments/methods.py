@@ -12,6 +12,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_rpto.algorithms import RPO, RPTO, RTO
+from sb3_rpto.algorithms.distil import clone_kwargs
 from sb3_rpto.algorithms.mbpo import MBPO
 from sb3_rpto.algorithms.pdml import PDML
 from sb3_rpto.algorithms.ptp import PTP
@@ -122,6 +123,7 @@ def _sac_mixed(run: Run, curve: LearningCurve) -> None:
 
 def _trpo_warm(run: Run, curve: LearningCurve) -> None:
     baselines.trpo_steps(run.budget, run.kwargs.get("n_steps"))
+    clone_kwargs(SAC.load(run.source_model, device="cpu"))  # what cannot be cloned shows before states are collected
     states = run.source_transitions(curve)["observations"]
     model = baselines.cloned_trpo(
         run.source_model, run.make_target(), run.seed, run.budget, states, run.device, **run.kwargs

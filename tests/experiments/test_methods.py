@@ -240,6 +240,15 @@ def test_what_a_method_cannot_do_costs_no_source_step(
     assert not spent
 
 
+def test_a_policy_that_cannot_be_cloned_costs_no_source_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    SAC("MlpPolicy", cartpole(), use_sde=True, policy_kwargs=SMALL_POLICY, device="cpu").save(tmp_path / "sac.zip")
+    spent: list[Any] = []
+    monkeypatch.setattr(baselines, "source_transitions", lambda *args: spent.append(args))
+    with pytest.raises(NotImplementedError, match="use_sde"):
+        run("trpo-warm", str(tmp_path / "sac.zip"))
+    assert not spent
+
+
 def test_trpo_warm_starts_as_the_sac(source_model: str) -> None:
     states = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
     model = baselines.cloned_trpo(source_model, cartpole(), 0, 1000, states)
