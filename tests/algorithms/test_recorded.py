@@ -16,13 +16,14 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import SMALL_ENSEMBLE, SMALL_POLICY
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPTO, RTO
 from sb3_rpto.algorithms import closing, renewal
-from sb3_rpto.algorithms.recorded import transitions
+from sb3_rpto.algorithms.recorded import check_log, transitions
 from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
@@ -81,6 +82,33 @@ def model(measured: Measurements, cls: type = RPTO, env: gym.Env | None = None, 
 
 
 # --- D_target ---------------------------------------------------------------------------------------------------------
+
+
+class Remembering(InvertedPendulumEnv):
+    """Observes what was commanded last, or before that, behind sensors with noise."""
+
+    def __init__(self, back: int) -> None:
+        self.back, self.sent = back, [np.zeros(1), np.zeros(1)]
+        super().__init__()
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (5,))
+
+    def step(self, action: np.ndarray) -> Any:
+        self.sent = [np.asarray(action), self.sent[0]]
+        return super().step(action)
+
+    def _get_obs(self) -> np.ndarray:
+        shown = self.data.ctrl if self.back == 0 else self.sent[self.back]
+        return np.concatenate([super()._get_obs() + self.np_random.normal(0, 1e-4, 4), shown])
+
+
+@pytest.mark.parametrize("back", [0, 1])
+def test_observations_that_no_state_tells_are_refused(back: int) -> None:
+    env = gym.wrappers.TimeLimit(Remembering(back), 100)
+    if back == 0:
+        check_log(log(), env)
+    else:
+        with pytest.raises(ValueError, match=r"observation\[4\] does not follow from the state and the command alone"):
+            check_log(log(), env)
 
 
 def test_an_encoder_that_counts_from_another_turn_makes_the_same_transitions() -> None:
