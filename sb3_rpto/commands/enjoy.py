@@ -129,11 +129,11 @@ def _model(path: Path) -> tuple[Path, dict[str, Any]]:
         options.check_file(path, "MODEL")
         return path, {}
     known = RunFolder(path).begun() or {}
-    if known and RunFolder(path).result.exists() and not (path / "model.zip").is_file():
-        raise FileNotFoundError(
-            f"MODEL {path}: its run is finished and model.zip is gone; remove result.json, and repeat the command"
-        )
     if known and not (path / "model.zip").is_file():
+        if RunFolder(path).result.exists():
+            raise FileNotFoundError(
+                f"MODEL {path}: its run is finished and model.zip is gone; remove result.json, and repeat the command"
+            )
         raise FileNotFoundError(f"MODEL {path}: its run is not finished; repeat the command that began it to go on")
     options.check_file(path / "model.zip", "MODEL")
     return path / "model.zip", {name: value for name, value in known.items() if value is not None}

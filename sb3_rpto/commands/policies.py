@@ -76,11 +76,8 @@ def statistics_of(path: str | Path) -> Path | None:
     """
     path = Path(path)
     prefix, _, steps = path.stem.removesuffix("_steps").rpartition("_")
-    own = (
-        "vecnormalize.pkl",
-        f"{prefix}_vecnormalize_{steps}_steps.pkl",
-        "statistics.pkl",
-    )  # the last: of our documents
+    # The zoo's, those of SB3's CheckpointCallback, and those that docs/checkpoints.md saves.
+    own = ("vecnormalize.pkl", f"{prefix}_vecnormalize_{steps}_steps.pkl", "statistics.pkl")
     zoo = (file for file in path.parent.glob("*/vecnormalize.pkl") if file.with_name("args.yml").is_file())
     found = (*(path.with_name(name) for name in own), *zoo)
     return next((file for file in found if file.is_file()), None)

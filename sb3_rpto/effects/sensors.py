@@ -30,10 +30,10 @@ def _lengths(model: mujoco.MjModel, actuator: int) -> dict[int, float]:
     on = int(model.actuator_trnid[actuator, 0])
     if model.actuator_trntype[actuator] in JOINTS:
         return {on: 1.0}
-    wraps = range(model.tendon_adr[on], model.tendon_adr[on] + model.tendon_num[on]) if model.ntendon else range(0)
-    fixed = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_TENDON and all(
-        model.wrap_type[i] == mujoco.mjtWrap.mjWRAP_JOINT for i in wraps
-    )
+    if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_TENDON:
+        return {}
+    wraps = range(model.tendon_adr[on], model.tendon_adr[on] + model.tendon_num[on])
+    fixed = all(model.wrap_type[i] == mujoco.mjtWrap.mjWRAP_JOINT for i in wraps)
     return {int(model.wrap_objid[i]): float(model.wrap_prm[i]) for i in wraps} if fixed else {}
 
 

@@ -58,6 +58,8 @@ class World(ABC):
         """Nothing acts in the substep to come, until effects say so."""
         self.force[:], self.pull[:], self.friction[:], self.loss[:], self.missed[:] = 0, 0, 0, 0, 0
         self.room[:] = -np.inf, np.inf
+        if self._base_range is not None:  # what the simulator computes before they do is without it
+            self.field("actuator_forcerange")[:, self._tight] = self._base_range[:, self._tight]
 
     def force_range(self, actuator: int) -> np.ndarray:
         """What the model, without :attr:`room`, lets an actuator give, (n, 2)."""

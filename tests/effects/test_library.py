@@ -467,6 +467,8 @@ def test_a_servo_on_a_tendon_regulates_what_its_joints_sensors_show() -> None:
     assert biases("one", offset("k", offset=0.1)) == pytest.approx([0, -50])
     assert biases("one", gain("j", change=0.2)) == pytest.approx([0, -60])
     assert biases("both", gain("j", change=0.2)) == pytest.approx([0, -50])
+    text = text.replace("</body></body>", '<site name="s"/></body></body>').replace('tendon="%s"', 'site="s" name="%s"')
+    assert biases("at a site", offset("j", offset=0.1)) == pytest.approx([0, -50])
 
 
 def test_lag_is_the_mean_of_filterexact() -> None:

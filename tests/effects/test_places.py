@@ -50,6 +50,17 @@ def test_load_friction_is_of_the_torque_that_a_weak_motor_gives() -> None:
     assert speed(strong, [friction, weak], [1.0]) == pytest.approx(right, rel=1e-9)
 
 
+@pytest.mark.parametrize("other", ['<motor tendon="t"/>', '<general joint="h" dyntype="filter" dynprm="0.01"/>'])
+def test_where_the_simulator_tells_the_load_a_weak_motor_is_one_with_a_forcerange(other: str) -> None:
+    text = '<motor name="m" joint="h" gear="10" {}/>' + other
+    limited, strong = (arms(text.format(ends)) for ends in ('forcerange="-.1 .1"', ""))
+    friction = LIBRARY["load_friction"]("h", mu=0.2)
+    weak = LIBRARY["dc_motor"]("m", inverse_stall=1.0)
+    assert speed(strong, [weak, friction], [1.0, 0.0], 20) == pytest.approx(
+        speed(limited, [friction], [1.0, 0.0], 20), rel=1e-9
+    )
+
+
 def test_two_weak_motors_lose_their_torques_together_within_the_joints_range() -> None:
     model = arms(f'{ONE}<motor name="n" joint="h"/>', joint='actuatorfrcrange="-1.5 1.5"')
     weak = [LIBRARY["dc_motor"](name, inverse_stall=1 / 0.6) for name in "mn"]
