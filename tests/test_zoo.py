@@ -213,15 +213,15 @@ def test_another_seed_begins_new_streams(trained):
 
 
 def test_worlds_are_as_they_were_where_a_run_goes_on(zoo, tmp_path, capsys):
-    from sb3_rpto.zoo.manager import config_beside
+    from sb3_rpto.zoo.manager import settings_beside
 
     begun = launch(tmp_path, "rpo", "-n", "4", "--source-timesteps", "120", "--eval-freq", "-1", *COLD, "n_envs:2")
     capsys.readouterr()
     resumed = launch(tmp_path, "rpo", "-n", "8", "--eval-freq", "-1", "-i", str(final(begun)))
     assert "As before: n_envs: 2, normalize: True" in capsys.readouterr().out
-    assert config_beside(str(final(resumed)))["n_envs"] == 2
+    assert settings_beside(str(final(resumed)), "config.yml")["n_envs"] == 2
     last = launch(tmp_path, "rpo", "-n", "12", "--eval-freq", "-1", "-i", str(final(resumed)), "-params", "n_envs:1")
-    config = config_beside(str(final(last)))
+    config = settings_beside(str(final(last)), "config.yml")
     assert (config["n_envs"], config["normalize"]) == (1, True)
 
 

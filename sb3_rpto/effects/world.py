@@ -46,12 +46,12 @@ class World(ABC):
         self.pulls = False  # whether there was any since settle
         self.loss = np.zeros((n, model.nv))  # N·m or N, what motors do not give of their torques
         self.missed = np.zeros((n, model.nv))  # N·m or N, what reaches the joints less for it
-        self.room = np.zeros((n, model.nu, 2))  # lowest and highest force of the actuators, in their units
+        self.room = np.zeros((n, model.nactuator, 2))  # lowest and highest force of the actuators, in their units
         self._nominal: dict[str, np.ndarray] = {}
         self._base_friction: np.ndarray | None = None  # (n, nv), before the substep's own
         self._dry = np.zeros(model.nv, dtype=bool)  # joints whose friction has varied since settle
-        self._base_range: np.ndarray | None = None  # (n, nu, 2), before the substep's own
-        self._tight = np.zeros(model.nu, dtype=bool)  # actuators whose force was limited since settle
+        self._base_range: np.ndarray | None = None  # (n, nactuator, 2), before the substep's own
+        self._tight = np.zeros(model.nactuator, dtype=bool)  # actuators whose force was limited since settle
         self.forget()
 
     def forget(self) -> None:
