@@ -17,7 +17,7 @@ from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import StateMap
 
 #: Episodes, and steps of each, that are compared with MuJoCo alone: what remembers shows after the first.
-TRIED, FOLLOWED = 3, 8
+TRIED, FOLLOWED = 3, 4
 #: All that a simulation of transitions starts from. What else a reset sets, a mocap body say, it does not know.
 KNOWN = ("qpos", "qvel", "act", "history", "qacc_warmstart")
 #: Episodes and steps of each whose states are compared with what the observations are said to show.
