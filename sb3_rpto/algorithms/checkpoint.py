@@ -52,7 +52,7 @@ NOT_SAVED = (
 )
 
 
-#: Arguments that the saved dynamics were built by.
+#: Arguments that the saved dynamics, networks and buffers were made by.
 FIXED = frozenset(
     {"dynamics", "dynamics_kwargs", "declared", "close_loop", "preset", "target_data", "use_sde", "n_steps"}
 )
