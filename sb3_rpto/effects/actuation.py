@@ -67,24 +67,24 @@ def _moves_otherwise(model: mujoco.MjModel, actuator: int, joint: int) -> bool:
         return False
     if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_TENDON:
         return True
-    joints = _joints_of(model, actuator)
+    joints = joints_of_tendon(model, actuator)
     return joints is None or joint in joints
 
 
-def _joints_of(model: mujoco.MjModel, actuator: int) -> list[int] | None:
-    """The joints of an actuator's fixed tendon; None of a spatial one, which may move any."""
+def joints_of_tendon(model: mujoco.MjModel, actuator: int) -> dict[int, float] | None:
+    """The joints of an actuator's fixed tendon, with their coefficients; None of a spatial one, which may move any."""
     tendon = model.actuator_trnid[actuator, 0]
     wraps = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
     if (model.wrap_type[wraps] != mujoco.mjtWrap.mjWRAP_JOINT).any():
         return None
-    return [int(joint) for joint in model.wrap_objid[wraps]]
+    return dict(zip(model.wrap_objid[wraps].tolist(), model.wrap_prm[wraps].tolist()))
 
 
 def driven(model: mujoco.MjModel) -> set[int]:
     """The joints that an actuator drives, by itself or through a fixed tendon."""
     tendons = [a for a in range(model.nactuator) if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON]
     on = {joint for joint in range(model.njnt) if drivers(model, joint)}
-    return on.union(*(_joints_of(model, a) or () for a in tendons))
+    return on.union(*(joints_of_tendon(model, a) or () for a in tendons))
 
 
 def motor_torque(world: World, actuator: int, dof: int, adr: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.actuation import JOINTS
+from sb3_rpto.effects.actuation import JOINTS, joints_of_tendon
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.world import World
 
@@ -27,14 +27,11 @@ def readers(sensor: Effect, model: mujoco.MjModel) -> dict[int, float]:
 
 def _lengths(model: mujoco.MjModel, actuator: int) -> dict[int, float]:
     """The joints whose positions an actuator's length sums, each with its factor; none of other kinds of length."""
-    on = int(model.actuator_trnid[actuator, 0])
     if model.actuator_trntype[actuator] in JOINTS:
-        return {on: 1.0}
+        return {int(model.actuator_trnid[actuator, 0]): 1.0}
     if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_TENDON:
         return {}
-    wraps = range(model.tendon_adr[on], model.tendon_adr[on] + model.tendon_num[on])
-    fixed = all(model.wrap_type[i] == mujoco.mjtWrap.mjWRAP_JOINT for i in wraps)
-    return {int(model.wrap_objid[i]): float(model.wrap_prm[i]) for i in wraps} if fixed else {}
+    return joints_of_tendon(model, actuator) or {}
 
 
 def ago(steps: np.ndarray, q: np.ndarray, v: np.ndarray) -> Pair:

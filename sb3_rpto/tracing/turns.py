@@ -89,9 +89,9 @@ def _commanded(model: mujoco.MjModel, data: Measurements, episode: Episode, join
     names = [object_names(model, "actuator")[a] for a in servos]
     if len(servos) != 1 or names[0] not in data.columns.ctrl:
         return np.full(len(episode.time), np.nan)
-    low, high = command_limits(model)
+    low, high = (limits[model.actuator_ctrladr[servos[0]]] for limits in command_limits(model))
     column = data.columns.ctrl.index(names[0])
-    command = np.clip(episode.ctrl[:, column], low[servos[0]], high[servos[0]])
+    command = np.clip(episode.ctrl[:, column], low, high)
     return np.where(episode.enabled[:, column] > 0, command / model.actuator_gear[servos[0], 0], np.nan)
 
 

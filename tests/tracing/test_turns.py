@@ -98,6 +98,17 @@ def test_what_a_servo_holds_comes_to_its_command(centre: float, gear: float) -> 
     assert [f.kind for f in found] == ["whole turns"]
 
 
+def test_a_servos_limits_are_its_own_where_another_actuator_takes_two_commands() -> None:
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body>
+        <joint name="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".03"/></body><body>
+        <joint name="other" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".03"/></body></worldbody>
+        <actuator><pid name="two" joint="other" kp="1"/><position name="servo" joint="hinge" kp="6" ctrlrange="3 9"/>
+        </actuator></mujoco>""")
+    angle = np.full(200, 3.2)
+    data, _ = settle_turns(model, commanded(angle - TURN, np.full(200, -50.0)))  # held at the lower end
+    np.testing.assert_allclose(data.episodes[0].qpos[:, 0], angle, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("command", "columns"),
     [
