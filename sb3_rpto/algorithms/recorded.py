@@ -20,7 +20,7 @@ from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.envs.observations import env_name, layers, leaves_observations
 from sb3_rpto.envs.rules import Rule, task_rules
-from sb3_rpto.envs.steps import LEAST, OFF, SHOWN, STEPS
+from sb3_rpto.envs.steps import beyond_states, observe
 from sb3_rpto.tracing import Episode, Measurements
 from sb3_rpto.tracing.model_checks import check_clock, check_names
 from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, half_step, start_state, straight
@@ -56,37 +56,12 @@ def check_log(measured: Measurements, env: gym.Env) -> None:
                 f"{env_name(env)}: the wrapper {type(layer).__name__} shows more than the state, so a log does not "
                 "tell its observations; give the environment without it"
             )
-    hidden = _beyond_states(env)
+    hidden = beyond_states(env)
     if hidden is not None:
         raise ValueError(
             f"{env_name(env)}: observation[{hidden}] does not follow from the state and the command alone (an action "
             "before, forces of a step?), so a log does not tell it; give an environment that observes states"
         )
-
-
-def _beyond_states(env: gym.Env) -> int | None:
-    """The first observation of a step that is not that of the state which it led to, but for some noise; or None.
-
-    A copy is stepped by random actions. Nothing is found where it cannot be copied.
-    """
-    one, other = copy_env(env), copy_env(env)
-    if one is None or other is None:
-        return None
-    data: Any = one.unwrapped.data  # type: ignore[attr-defined]
-    one.action_space.seed(0)
-    seen, shown = list[np.ndarray](), list[np.ndarray]()
-    for seed in range(SHOWN):
-        for copy in (one, other):
-            copy.reset(seed=seed)  # with the same goal, if there is one
-        over, steps = False, 0
-        while not over and steps < STEPS:
-            observation, _, *ended, _ = one.step(one.action_space.sample())
-            seen.append(np.asarray(observation, dtype=float))
-            shown.append(observe(other, data.qpos.copy(), data.qvel.copy(), data.ctrl.copy()))
-            over, steps = any(ended), steps + 1
-    true = np.array(seen)
-    wrong = np.sqrt(((true - shown) ** 2).mean(axis=0)) > np.maximum(OFF * true.std(axis=0), LEAST)
-    return int(np.flatnonzero(wrong)[0]) if wrong.any() else None
 
 
 def transitions(
@@ -211,18 +186,6 @@ class _Log:
         curve = CubicHermiteSpline(time[rows], q[:, of_qpos], v[:, of_qvel])
         qpos[:, of_qpos], qvel[:, of_qvel] = curve(nodes), curve(nodes, 1)
         return qpos, qvel
-
-
-def observe(env: gym.Env, qpos: np.ndarray, qvel: np.ndarray, command: np.ndarray) -> np.ndarray:
-    """What the agent would see in a state, (observation_dim,)."""
-    base: Any = env.unwrapped
-    base.data.ctrl[:] = command  # some tasks observe forces
-    base.set_state(qpos, qvel)
-    observation = base._get_obs()
-    for layer in reversed(layers(env)[:-1]):
-        if isinstance(layer, gym.ObservationWrapper):
-            observation = layer.observation(observation)
-    return np.array(observation)
 
 
 def _finished(

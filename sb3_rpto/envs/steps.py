@@ -14,7 +14,7 @@ from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.engine import quiet
 from sb3_rpto.effects.model import differing
 from sb3_rpto.envs.copies import copy_env
-from sb3_rpto.envs.observations import StateMap
+from sb3_rpto.envs.observations import StateMap, layers
 
 #: Episodes, and steps of each, that are compared with MuJoCo alone: what remembers shows after the first.
 TRIED, FOLLOWED = 3, 4
@@ -144,6 +144,45 @@ def _is_off(off: np.ndarray, true: np.ndarray) -> bool:
     noise = 4 * float(np.std(off - off.mean() - scale * moved)) / np.sqrt(len(off))
     by = max(float(abs(off.mean())), abs(scale) * spread)
     return by > max(LEAST, SYSTEMATIC * spread, noise) or bool(np.sqrt((off**2).mean()) > max(OFF * spread, LEAST))
+
+
+def beyond_states(env: gym.Env) -> int | None:
+    """The first observation of a step that is not that of the state which it led to, but for some noise; or None.
+
+    A copy is stepped by random actions. Nothing is found where it cannot be copied.
+
+    :param env: a MuJoCo environment; untouched
+    """
+    one, other = copy_env(env), copy_env(env)
+    if one is None or other is None:
+        return None
+    data: Any = one.unwrapped.data  # type: ignore[attr-defined]
+    one.action_space.seed(0)
+    seen, shown = list[np.ndarray](), list[np.ndarray]()
+    for seed in range(SHOWN):
+        for copy in (one, other):
+            copy.reset(seed=seed)  # with the same goal, if there is one
+        over, steps = False, 0
+        while not over and steps < STEPS:
+            observation, _, *ended, _ = one.step(one.action_space.sample())
+            seen.append(np.asarray(observation, dtype=float))
+            shown.append(observe(other, data.qpos.copy(), data.qvel.copy(), data.ctrl.copy()))
+            over, steps = any(ended), steps + 1
+    true = np.array(seen)
+    wrong = np.sqrt(((true - shown) ** 2).mean(axis=0)) > np.maximum(OFF * true.std(axis=0), LEAST)
+    return int(np.flatnonzero(wrong)[0]) if wrong.any() else None
+
+
+def observe(env: gym.Env, qpos: np.ndarray, qvel: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """What the agent would see in a state, (observation_dim,)."""
+    base: Any = env.unwrapped
+    base.data.ctrl[:] = command  # some tasks observe forces
+    base.set_state(qpos, qvel)
+    observation = base._get_obs()
+    for layer in reversed(layers(env)[:-1]):
+        if isinstance(layer, gym.ObservationWrapper):
+            observation = layer.observation(observation)
+    return np.array(observation)
 
 
 def odd_memory(env: gym.Env, recover: StateMap) -> str | None:
