@@ -342,8 +342,7 @@ class LoopCloser:
         :param before: error of ``data`` without them; infinite: the report judges
         """
         known = {effect.label for effect in dynamics.effects()}
-        all_traced = (*report.declared, *report.effects)
-        found = [traced.effect for traced in all_traced]
+        found = [traced.effect for traced in (*report.declared, *report.effects)]
         new = [effect.label for effect in found if effect.label not in known and not isinstance(effect, Declared)]
         late = any(effect.overrides("late") for effect in found)
         if late:  # what was seen before a step began tells nothing of one-step errors
@@ -351,10 +350,9 @@ class LoopCloser:
         nearer = report.verdict != "unexplained" or report.adequacy_after.ratio < report.adequacy_before.ratio
         if before == math.inf and new and not nearer:
             return []
-        kept = dynamics.effects(), dynamics.deviations()
-        declared = [effect for effect in dynamics.effects() if isinstance(effect, Declared)]
-        dynamics.replace(declared, dynamics.deviations())
-        dynamics.adopt(found, {traced.label: traced.deviation for traced in all_traced})
+        kept = dynamics.effects(), dynamics.covariance.copy()
+        dynamics.replace([effect for effect in dynamics.effects() if isinstance(effect, Declared)])
+        dynamics.adopt(found, report.covariance)
         assert model.env is not None
         if not stays_finite(dynamics, data, model.env):
             dynamics.replace(*kept)

@@ -266,15 +266,18 @@ class OneStep:
         """Weights of the residuals (n, c) in the least squares that stand for the robust loss."""
         return np.asarray(self.share[:, None] / np.sqrt(1 + (residual / self.clip) ** 2))
 
-    def deviation(self, values: np.ndarray) -> np.ndarray:
-        """Standard deviation of phi by the sandwich estimate (Huber 1967), (p,).
+    def covariance(self, values: np.ndarray) -> np.ndarray:
+        """Covariance of phi by the sandwich estimate (Huber 1967), (p, p).
 
         Scores of up to :data:`LAGS` transitions in a row may be correlated (Newey and West 1987): an observation that
         errs ends one transition and begins the next, and what the simulator lacks lasts longer than a transition.
-        Infinite for what the transitions do not show or tell apart.
+        Of what the transitions do not show or tell apart the variance is infinite, and the rest of its row zero.
         """
-        spread = self._spread(*self._curvature(values), ~self.held & ~self.left) * self.scale
-        return np.where(self.unseen | self.entangled, np.inf, spread)
+        told = self._covariance(*self._curvature(values), ~self.held & ~self.left) * np.outer(self.scale, self.scale)
+        unknown = self.unseen | self.entangled
+        told[unknown] = told[:, unknown] = 0.0
+        told[unknown, unknown] = np.inf
+        return told
 
     def vague(self, values: np.ndarray) -> np.ndarray:
         """Parameters that the transitions show, if at all, too faintly to tell: :data:`VAGUE`; (p,).
@@ -284,7 +287,7 @@ class OneStep:
         curvature, free = self._curvature(values), ~self.held & ~self.left & ~self.unseen
         found = self.unseen.copy()
         while free.any():
-            spread = np.where(free, self._spread(*curvature, free), 0.0)
+            spread = np.where(free, np.sqrt(np.diag(self._covariance(*curvature, free))), 0.0)
             worst = int(np.argmax(spread))
             if not spread[worst] > VAGUE:
                 break
@@ -299,14 +302,15 @@ class OneStep:
         hessian = np.einsum("nc,ncp,ncq->pq", curved, slopes, slopes)
         return hessian, np.einsum("nc,ncp,nc->np", self.robust(residual), slopes, residual)
 
-    def _spread(self, hessian: np.ndarray, scores: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """Standard deviations in scales where only the ``free`` ones move; infinite for others and without slope."""
+    def _covariance(self, hessian: np.ndarray, scores: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """Covariance in scales where only the ``free`` ones move; infinite variances for others and without slope."""
         moving = np.flatnonzero((np.diag(hessian) > 0) & free)
         inverse = np.linalg.pinv(hessian[np.ix_(moving, moving)], rcond=1e-10, hermitian=True)
-        meat = self._scatter(scores[:, moving])
-        spread = np.full(len(free), np.inf)
-        spread[moving] = np.sqrt(np.maximum(np.diag(inverse @ meat @ inverse), 0.0))
-        return spread
+        found = np.diag(np.full(len(free), np.inf))
+        # Positive in every direction, rounding apart: Newey and West's weights are.
+        found[np.ix_(moving, moving)] = inverse @ self._scatter(scores[:, moving]) @ inverse
+        found[moving, moving] = np.maximum(found[moving, moving], 0.0)
+        return found
 
     def _scatter(self, scores: np.ndarray) -> np.ndarray:
         """Covariance of the sum of the transitions' scores (n, p), by Newey and West's weights; (p, p)."""

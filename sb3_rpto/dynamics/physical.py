@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from scipy.linalg import block_diag
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
@@ -63,8 +64,8 @@ class PhysicalDynamics(Dynamics):
     :param max_step: largest change of a parameter in one step, as a share of its value or its scale (its nominal value,
         or what is plausible), whichever is larger
     :param max_steps: steps that a fit takes at most, unless it is told otherwise
-    :param randomise: each source episode has a phi of its own, drawn from a normal distribution around the estimate
-        with so many times its standard deviation; 0: the estimate itself
+    :param randomise: each source episode has a phi of its own, drawn from the normal distribution around the estimate
+        that its covariance tells, so many times as wide; 0: the estimate itself
     :param threads: that simulate; 0: one for each core
     :param observation_noise: standard deviation of the white noise of each of the target's observations, (d,), or of
         all alike, in their units: what a sensor shows while the machine stands still. A closed loop's traces reckon
@@ -76,7 +77,7 @@ class PhysicalDynamics(Dynamics):
     fits_newest: ClassVar[int] = 500  # a few numbers are known long before
 
     _values: th.Tensor
-    _deviation: th.Tensor
+    _covariance: th.Tensor
 
     def __init__(
         self,
@@ -126,8 +127,8 @@ class PhysicalDynamics(Dynamics):
         known: list[Effect] = [*declare(model, declared)]
         self._adopt([*known, *map(from_json, effects)])
 
-    def _adopt(self, effects: Sequence[Effect], deviations: Mapping[str, np.ndarray] | None = None) -> None:
-        """Let phi be the values of these effects, with deviations by their labels, 0 where none is told."""
+    def _adopt(self, effects: Sequence[Effect], covariance: np.ndarray | None = None) -> None:
+        """Let phi be the values of these effects, with their covariance (p, p); None: all zero."""
         self.simulation = Simulation(self.model, effects, self.threads)
         largest = np.abs(self.model.actuator_ctrlrange).max(axis=1, initial=0)[self.model.actuator_ctrladr]
         gears = np.abs(self.model.actuator_gear[:, 0]) * largest
@@ -141,9 +142,8 @@ class PhysicalDynamics(Dynamics):
         self.scale = np.maximum(np.abs(self.simulation.null), sizes)
         device = self._values.device if "_values" in self._buffers else None
         self.register_buffer("_values", th.as_tensor(values, dtype=th.float64, device=device))
-        told = [(deviations or {}).get(e.label, np.zeros(len(e.parameters))) for e in self.simulation.effects]
-        deviation = np.concatenate([*told, np.zeros(0)])
-        self.register_buffer("_deviation", th.as_tensor(deviation, dtype=th.float64, device=device))
+        told = np.zeros((len(values), len(values))) if covariance is None else covariance
+        self.register_buffer("_covariance", th.as_tensor(told, dtype=th.float64, device=device))
 
     # ------------------------------------------------------------------ phi
 
@@ -153,12 +153,17 @@ class PhysicalDynamics(Dynamics):
         return self._values.cpu().numpy()
 
     @property
-    def deviation(self) -> np.ndarray:
-        """Standard deviation of phi in its units, (p,): of the last fit (robust against correlated errors) or trace.
+    def covariance(self) -> np.ndarray:
+        """Covariance of phi in its units, (p, p): of the last fit (robust against correlated errors) or trace.
 
-        0 before; infinite for a parameter that the data did not determine.
+        0 before; of a parameter that the data did not determine the variance is infinite, and the rest of its row 0.
         """
-        return self._deviation.cpu().numpy()
+        return self._covariance.cpu().numpy()
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviation of phi in its units, (p,), from the :attr:`covariance`."""
+        return np.sqrt(np.diag(self.covariance))
 
     def effects(self, generator: np.random.Generator | None = None) -> list[Effect]:
         """Declared numbers and effects with the values of phi, for :class:`~sb3_rpto.effects.CorrectedEnv`.
@@ -166,33 +171,37 @@ class PhysicalDynamics(Dynamics):
         :param generator: draws phi from its uncertainty, ``randomise`` times as wide, but for parameters that the data
             did not determine; None: the estimate
         """
-        values = self.values
+        values = self.values.copy()
         if generator is not None and self.randomise > 0:
-            known = np.where(np.isfinite(self.deviation), self.deviation, 0.0)  # nothing tells how far else to go
-            values = values + self.randomise * known * generator.standard_normal(len(values))
+            told = np.flatnonzero(np.isfinite(self.deviation) & (self.deviation > 0))  # of the rest nothing tells it
+            spread = self.deviation[told]
+            # What the data tell together, such as a mass and its friction, differs together.
+            share, axes = np.linalg.eigh(self.covariance[np.ix_(told, told)] / np.outer(spread, spread))
+            drawn = axes @ (np.sqrt(np.maximum(share, 0.0)) * generator.standard_normal(len(told)))
+            values[told] += self.randomise * spread * drawn
             values = np.clip(values, self.simulation.lower, self.simulation.upper)
         return [e.with_values(values[s]) for e, s in zip(self.simulation.effects, self.simulation.slices)]
 
-    def deviations(self) -> dict[str, np.ndarray]:
-        """:attr:`deviation` by the labels of the effects, each (number of its parameters,)."""
-        return {e.label: self.deviation[s] for e, s in zip(self.simulation.effects, self.simulation.slices)}
-
-    def adopt(self, found: Sequence[Effect], deviations: Mapping[str, np.ndarray] | None = None) -> None:
+    def adopt(self, found: Sequence[Effect], covariance: np.ndarray | None = None) -> None:
         """Take effects that were traced into phi, and the values that declared numbers had beside them.
 
-        :param found: declared numbers by the names that were declared, and further effects
-        :param deviations: standard deviations of their parameters by their labels; 0 for those that are not told
+        :param found: declared numbers by the names that were declared, and further effects, p' parameters in all
+        :param covariance: of these parameters in this order, (p', p'); None: all zero
         """
-        mine, known = {e.label: e for e in self.effects()}, self.deviations()
+        mine = {e.label: e for e in self.effects()}
+        rows = {label: list(range(s.start, s.stop)) for label, s in zip(mine, self.simulation.slices)}
+        begin = end = len(self.values)
         for effect in found:
             old = mine.get(effect.label)
             mine[effect.label] = effect if old is None else old.with_values(effect.values)
-            known[effect.label] = np.zeros(len(effect.parameters))
-        self._adopt(list(mine.values()), {**known, **(deviations or {})})
+            rows[effect.label] = list(range(end, end := end + len(effect.parameters)))
+        told = np.zeros((end - begin, end - begin)) if covariance is None else covariance
+        order = [row for label in mine for row in rows[label]]
+        self._adopt(list(mine.values()), block_diag(self.covariance, told)[np.ix_(order, order)])
 
-    def replace(self, effects: Sequence[Effect], deviations: Mapping[str, np.ndarray]) -> None:
-        """Let phi be exactly these, as :meth:`effects` and :meth:`deviations` gave them."""
-        self._adopt(list(effects), deviations)
+    def replace(self, effects: Sequence[Effect], covariance: np.ndarray | None = None) -> None:
+        """Let phi be exactly these, as :meth:`effects` and :attr:`covariance` gave them; None: all zero."""
+        self._adopt(effects, covariance)
 
     def runs(self, observations: np.ndarray, actions: np.ndarray) -> bool:
         """Whether simulations from some states under some actions stay finite.
@@ -354,7 +363,7 @@ class PhysicalDynamics(Dynamics):
             )
             return {"steps": 0.0, **counts}
         problem.left |= vague
-        self._deviation.copy_(th.as_tensor(problem.deviation(values)))
+        self._covariance.copy_(th.as_tensor(problem.covariance(values)))
         self._name_unseen(problem.left)
         self._name_entangled(problem.entangled, problem.held)
         return {"steps": float(taken), **counts}

@@ -17,13 +17,14 @@ LEAST = 1.5
 FINAL = 40
 
 
-def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit on train and select together.
 
     Of what was given and only shows together, the last one stays what it was.
 
-    :return: all parameters (p,), and the bounds of their 95 % intervals (2, p), NaN where nothing was fitted, where
-        only several together are told, and where nothing shows in any window, which is what it was
+    :return: all parameters (p,); the bounds of their 95 % intervals (2, p), NaN where nothing was fitted, where only
+        several together are told, and where nothing shows in any window, which is what it was; their correlations
+        (p, p), by the curvature: blocks are too few to tell them
     """
     joined = problem.windows
     free = Selector(problem, problem, 0.0, lambda share, what: None).free(selection.model.effects)
@@ -35,6 +36,7 @@ def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarra
         free = np.setdiff1d(free, held)
         fit = problem.fit(begin, free, iterations=FINAL, crude=0.0)
     values, intervals = fit.values.copy(), np.full((2, len(fit.values)), np.nan)
+    correlation = np.eye(len(values))
     if len(free):
         linear = problem.linear(fit, free)
         curvature = np.einsum("wff->f", linear.normal)
@@ -46,7 +48,10 @@ def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarra
         intervals[:, free] = fit.values[free] + np.array([-1, 1])[:, None] * half
         intervals = np.clip(intervals, problem.lower, problem.upper)
         intervals[:, hidden] = intervals[:, alike] = np.nan
-    return values, intervals
+        inverse = _inverse(linear.normal.sum(0))
+        size = np.sqrt(np.diag(inverse))
+        correlation[np.ix_(free, free)] = inverse / np.outer(size, size)
+    return values, intervals, correlation
 
 
 def half_widths(linear: Linear, block: np.ndarray) -> np.ndarray:
@@ -61,8 +66,7 @@ def half_widths(linear: Linear, block: np.ndarray) -> np.ndarray:
     :param block: number of the block of each window, (W,)
     :return: NaN where fewer than :data:`LEAST` blocks tell a parameter
     """
-    normal = linear.normal.sum(0)
-    inverse = np.linalg.inv(normal + 1e-9 * np.eye(len(normal)) * max(1e-12, float(np.trace(normal))))
+    inverse = _inverse(linear.normal.sum(0))
     members = [block == b for b in np.unique(block)]
     gradients = np.stack([linear.gradient[m].sum(0) for m in members])
     # The mean gradient is not quite zero at a bound; only its scatter matters.
@@ -72,6 +76,10 @@ def half_widths(linear: Linear, block: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         spread = np.sqrt((moves**2).sum(0) * count / (count - 1)) * student.ppf(0.975, np.maximum(count - 1, 1))
     return np.where(count < LEAST, np.nan, spread)
+
+
+def _inverse(normal: np.ndarray) -> np.ndarray:
+    return np.linalg.inv(normal + 1e-9 * np.eye(len(normal)) * max(1e-12, float(np.trace(normal))))
 
 
 def not_told_apart(problem: Problem, fit: Fit, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -121,6 +121,7 @@ class Report:
     :param declared: fitted declared parameters, and the effects that were known beforehand, fitted
     :param effects: what the model lacks, with values; under ``partly explained`` and ``unexplained`` they lower the
         error and are no explanation
+    :param correlation: of the parameters of ``declared``, then ``effects``, (p, p): how their errors go together
     :param candidates: what became of each candidate
     :param adequacy_before: of the declared model on select windows
     :param adequacy_after: of the corrected model
@@ -152,6 +153,7 @@ class Report:
     verdict: str
     declared: list[Traced]
     effects: list[Traced]
+    correlation: np.ndarray
     candidates: list[Candidate]
     adequacy_before: Adequacy
     adequacy_after: Adequacy
@@ -198,6 +200,17 @@ class Report:
         """
         found = [t.effect for t in (*self.declared, *self.effects)]
         return [effect for effect in found if isinstance(effect, Declared) or not effect.does_nothing]
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of the parameters of ``declared``, then ``effects``, (p, p), for draws of phi around what was found.
+
+        Where an interval is unknown the variance is infinite, and the rest of its row zero.
+        """
+        spread = np.concatenate([*(t.deviation for t in (*self.declared, *self.effects)), np.zeros(0)])
+        known = np.isfinite(spread)
+        finite = np.where(known, spread, 0.0)
+        return self.correlation * np.outer(finite, finite) + np.diag(np.where(known, 0.0, np.inf))
 
     def apply(self, env: gym.Env) -> gym.Env:
         """A corrected copy of a gymnasium MuJoCo environment, for RPTO, SAC, anything; ``env`` stays as it is."""
@@ -355,6 +368,7 @@ class Report:
             "equation": self.equation(),
             "declared": [traced(t) for t in self.declared],
             "effects": [traced(t) for t in self.effects],
+            "correlation": self.correlation,
             "candidates": [vars(c) for c in self.candidates],
             "adequacy_before": vars(self.adequacy_before),
             "adequacy_after": vars(self.adequacy_after),

@@ -112,7 +112,7 @@ def trace(
 
     say(0.85, "fitting the final model")
     problem = selector.every_window()
-    final, intervals = refit(selection, problem)
+    final, intervals, correlation = refit(selection, problem)
     # Both models are fitted to all these data before they are compared on the test runs, the declared one as recorded.
     recorded = problem if zeros is None else first.on.fine.every_window()
     before = recorded.fit(first.base.fit.values, selector.free(()), iterations=FINAL, crude=0.0)
@@ -155,6 +155,7 @@ def trace(
         verdict=searched.verdict,
         declared=given,
         effects=kept,
+        correlation=_of_these(there, simulation, correlation),
         candidates=_fates(selector, found.screening, selection),
         adequacy_before=first.before,
         adequacy_after=found.after,
@@ -275,6 +276,13 @@ def _declared(simulation: Simulation, values: np.ndarray, intervals: np.ndarray)
         for e, s in pairs
         if e.known
     ]
+
+
+def _of_these(effects: Sequence[Effect], simulation: Simulation, correlation: np.ndarray) -> np.ndarray:
+    """Rows and columns of the parameters of these effects, in their order."""
+    rows = {e.label: range(len(correlation))[s] for e, s in zip(simulation.effects, simulation.slices)}
+    order = [row for effect in effects for row in rows[effect.label]]
+    return np.asarray(correlation[np.ix_(order, order)])
 
 
 def _kept(

@@ -354,6 +354,7 @@ def test_what_the_trace_left_open_is_what_episodes_differ_by(monkeypatch: pytest
     widths = np.concatenate([np.diff(t.interval, axis=0)[0] for t in traced])
     assert (widths > 0).all()
     np.testing.assert_allclose(made.dynamics.deviation, widths / 3.92)
+    np.testing.assert_array_equal(made.dynamics.covariance, made.loop.reports[0].covariance)
     monkeypatch.setattr(made.dynamics, "randomise", 2.0)
     rng = np.random.default_rng(0)
     drawn = np.array([np.concatenate([e.values for e in made.dynamics.effects(rng)]) for _ in range(200)])

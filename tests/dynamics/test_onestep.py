@@ -301,9 +301,9 @@ def test_what_the_data_do_not_show_stays_where_it_is(poles):
     assert task.unseen.tolist() == [True, False]
     assert moved[0] == nominal[0]
     assert moved[1] != nominal[1]
-    deviation = task.deviation(moved)
-    assert np.isinf(deviation[0])
-    assert deviation[1] > 0
+    covariance = task.covariance(moved)
+    assert covariance[0].tolist() == covariance[:, 0].tolist() == [np.inf, 0]
+    assert covariance[1, 1] > 0
 
 
 def test_weights_count_for_the_rows_they_belong_to():
@@ -365,7 +365,7 @@ def test_the_truth_is_as_often_within_the_deviation_as_it_says(kind):
         values = np.array([7.0])
         while (moved := task.step(values, 0.1)) is not None and abs(moved[0] - values[0]) > 1e-4:
             values = moved
-        off.append(abs(values[0] - 7.0) / task.deviation(values)[0])
+        off.append(abs(values[0] - 7.0) / np.sqrt(task.covariance(values)[0, 0]))
     assert np.mean(np.array(off) < 1.96) > 0.85
     assert np.mean(np.array(off) < 0.5) > 0.1  # and not as if it were much less certain
 
@@ -381,6 +381,23 @@ def test_the_deviation_is_that_of_repeated_fits():
         while (moved := task.step(values, 0.1)) is not None and abs(moved[0] - values[0]) > 1e-4:
             values = moved
         found.append(values[0])
-        said.append(task.deviation(values)[0])
+        said.append(np.sqrt(task.covariance(values)[0, 0]))
     assert np.mean(found) == pytest.approx(7.0, abs=np.std(found))
     assert np.mean(said) == pytest.approx(np.std(found), rel=0.5)
+
+
+@pytest.mark.slow
+def test_what_is_told_together_errs_together_as_the_covariance_says():
+    """A heavier cart and a stronger motor: what repeated fits find scatters along one line."""
+    names, truth = ["cart.mass", "slide.gear"], np.array([11.0, 110.0])
+    clean, found, said = collect(shifted(POLE, dict(zip(names, truth))), 40), [], []
+    for seed in range(24):
+        task = problem(steps_of(noisy(clean, 2e-2, seed), POLE), names, POLE)
+        values = truth
+        while (moved := task.step(values, 0.1)) is not None and np.abs(moved / values - 1).max() > 1e-5:
+            values = moved
+        covariance = task.covariance(values)
+        found.append(values)
+        said.append(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]))
+    assert abs(np.median(said)) > 0.5
+    assert np.median(said) == pytest.approx(np.corrcoef(np.array(found).T)[0, 1], abs=0.2)

@@ -431,17 +431,21 @@ def test_adopt_keeps_the_values_of_what_it_is_not_told():
     np.testing.assert_array_equal(model.deviation, np.zeros(6))
 
 
-def test_adopt_takes_deviations_and_keeps_those_of_what_it_is_not_told(pole):
+def test_adopt_takes_a_covariance_and_keeps_that_of_what_it_is_not_told(pole):
     model = dynamics(POLE)
     model.fit(noisy(pole, 1e-3), max_steps=3)
     found = CommandDelay("slide", delay=0.03)
-    damping = model.effects()[1]
-    before, known = model.effects(), model.deviations()
-    model.adopt([found, damping], {found.label: np.array([0.002])})
-    np.testing.assert_array_equal(model.deviation, [known["pole.mass"][0], 0, 0.002])
+    mass, damping = model.effects()
+    before, known = model.effects(), model.covariance.copy()
+    assert known[0, 1] == pytest.approx(known[1, 0])
+    assert known[0, 1] != 0
+    model.adopt([found, damping], np.array([[4e-6, 1e-6], [1e-6, 9e-6]]))
+    np.testing.assert_array_equal(model.covariance, [[known[0, 0], 0, 0], [0, 9e-6, 1e-6], [0, 1e-6, 4e-6]])
+    model.adopt([mass])
+    np.testing.assert_array_equal(model.deviation, [0, 3e-3, 2e-3])
     model.replace(before, known)
     assert model.names == list(SHIFTS[POLE])
-    np.testing.assert_array_equal(model.deviation, [*known["pole.mass"], *known["hinge.damping"]])
+    np.testing.assert_array_equal(model.covariance, known)
 
 
 def test_what_was_added_and_the_state_rebuild_the_model(pole):
@@ -474,6 +478,17 @@ def test_effects_are_phi_or_drawn_around_it(pole):
     assert all(isinstance(e, Declared) for e in model.effects(rng))
     model.randomise = 0.0
     assert [e.values[0] for e in model.effects(rng)] == model.values.tolist()
+
+
+def test_what_is_told_together_is_drawn_together():
+    model = dynamics(POLE, ["pole.mass=0.01:100", "cart.mass=0.01:100", "hinge.damping"], randomise=2.0)
+    covariance = np.array([[0.04, -0.019, 0], [-0.019, 0.01, 0], [0, 0, np.inf]])
+    model.adopt(model.effects(), covariance)
+    rng = np.random.default_rng(0)
+    drawn = np.array([[e.values[0] for e in model.effects(rng)] for _ in range(2000)])
+    np.testing.assert_allclose(np.cov(drawn[:, :2].T), 4 * covariance[:2, :2], rtol=0.1)
+    np.testing.assert_array_equal(drawn[:, 2], model.values[2])  # nothing tells how far it may be off
+    assert [e.values[0] for e in model.effects()] == model.values.tolist()
 
 
 # --- prediction -------------------------------------------------------------------------------------------------------

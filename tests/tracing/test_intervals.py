@@ -57,7 +57,8 @@ def test_intervals_are_as_wide_as_the_curvature_of_the_loss_says(monkeypatch: py
     selection, widths = Selection(s.model((0,), p.score(p.null))), []
     for curvature in (1.0, 0.5):
         monkeypatch.setattr(Loss, "curvature", lambda loss, r, by=curvature: by)
-        values, intervals = refit(selection, p)
+        values, intervals, correlation = refit(selection, p)
+        assert correlation.tolist() == [[1.0]]
         assert values[0] == pytest.approx(0.05, rel=0.05)
         widths.append(np.diff(intervals[:, 0])[0])
     assert 0 < widths[0] < 0.05
