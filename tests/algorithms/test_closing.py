@@ -1291,7 +1291,9 @@ def test_after_a_log_the_best_policy_is_left_and_the_last_one_goes_on_learning(m
     np.testing.assert_array_equal(weights(made), last)
 
 
-def test_a_callback_that_stops_a_run_on_a_log_leaves_the_best_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_callback_that_stops_a_run_on_a_log_leaves_the_best_policy(
+    soon: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)
     assert made.loop is not None
@@ -1303,7 +1305,7 @@ def test_a_callback_that_stops_a_run_on_a_log_leaves_the_best_policy(monkeypatch
     assert finished == [made]
 
 
-def test_a_target_after_a_log_is_not_traced_where_nobody_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_target_after_a_log_is_not_traced_where_nobody_asked(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, model_train_freq=20).learn(40, source_timesteps=0)
     with pytest.warns(UserWarning, match="D_target loses"):

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import ALGORITHMS, OURS
+from conftest import ALGORITHMS
 from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
@@ -44,6 +44,8 @@ from sb3_rpto.algorithms.transfer import TransferAlgorithm
 EPISODE = 10
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
+#: RPTO runs the code of all three.
+OURS = [pytest.param(RPO, marks=pytest.mark.slow), pytest.param(RTO, marks=pytest.mark.slow), RPTO]
 #: What SB3's own does changes with its version alone.
 every_class = pytest.mark.parametrize("cls", [pytest.param(SAC, marks=pytest.mark.slow), *OURS])
 ours = pytest.mark.parametrize("cls", OURS)

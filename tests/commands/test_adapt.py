@@ -146,6 +146,7 @@ def test_a_simulated_log_is_traced_as_one_where_that_is_said(given: Path, tmp_pa
     assert json.loads((tmp_path / "config.json").read_text())["simulated"] is True
 
 
+@pytest.mark.slow
 def test_what_is_known_is_fitted_and_not_found_again(given: Path, tmp_path: Path) -> None:
     mass = {"kind": "declared", "on": "", "values": {"pole.mass": 5.5}}
     known = [mass, LIBRARY["torque_offset"]("hinge", offset=0.3).to_json()]

@@ -487,9 +487,8 @@ def test_an_environment_that_does_more_than_its_model_is_told(gain: float, push:
     assert not [f for f in trace(driven(0.0)[0], data, candidates=[], threads=1).findings if f.kind == "own step"]
 
 
-@pytest.mark.parametrize(
-    ("threshold", "verdict"), [(5.0, "explained"), pytest.param(1e9, "unexplained", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("threshold", "verdict"), [(5.0, "explained"), (1e9, "unexplained")])
 def test_a_calibrated_threshold_is_the_one_that_selects(
     threshold: float, verdict: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
