@@ -15,32 +15,37 @@ class Descent:
     """Steps an optimizer down losses; only its own parameters get gradients (the actor's loss spares the critic's).
 
     Plain Adam takes torch's fused step on lists that are made once, not at every step; its state stays the optimizer's.
-    Other optimizers, and Adam with options of the user's, step as they are.
+    Other optimizers, and Adam with options of the user's, step as they are. Frozen parameters stay; the gradients of
+    the last step stay in ``grad``, for callbacks.
 
     :param optimizer: of any kind
     """
 
     def __init__(self, optimizer: th.optim.Optimizer) -> None:
         self.optimizer = optimizer
-        self.parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        own = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        self.parameters = [parameter for parameter in own if parameter.requires_grad]
+        optimizer.zero_grad()  # else a parameter that was frozen since would be stepped down its last gradient
         self._plain = _is_plain_adam(optimizer)
         self._state: tuple[list[th.Tensor], ...] = ()
 
     def __call__(self, loss: th.Tensor) -> None:
-        """One step down the gradient of ``loss``."""
-        self.step(th.autograd.grad(loss, self.parameters, allow_unused=True))
+        """One step down the gradient of ``loss``; hooks of the parameters act on it."""
+        for parameter in self.parameters:
+            parameter.grad = None
+        if self.parameters:
+            loss.backward(inputs=self.parameters)
+            self.step([parameter.grad for parameter in self.parameters])
 
     def step(self, gradients: Sequence[th.Tensor | None]) -> None:
-        """One step down gradients that are known, one for each parameter in the optimizer's order."""
+        """One step down gradients that are known, one for each parameter that learns, in the optimizer's order."""
+        for parameter, gradient in zip(self.parameters, gradients):
+            parameter.grad = gradient
         begun = len(self.optimizer.state) == len(self.parameters)  # the first step makes the state
         if self._plain and begun and all(gradient is not None for gradient in gradients):
             self._step_adam(list(gradients))
-            return
-        for parameter, gradient in zip(self.parameters, gradients):
-            parameter.grad = gradient
-        self.optimizer.step()
-        for parameter in self.parameters:
-            parameter.grad = None
+        else:
+            self.optimizer.step()
 
     def _step_adam(self, gradients: list[Any]) -> None:
         group = self.optimizer.param_groups[0]

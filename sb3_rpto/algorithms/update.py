@@ -254,7 +254,7 @@ class RelativeUpdate(SAC):
         if count == 0:
             return
         drawn = self.replay_buffer.sample(count * batch_size, env=self._vec_normalize_env, world=world)
-        for rows in zip(*(values.float().split(batch_size) for values in drawn[:5])):
+        for rows in zip(*(values.float().split(int(batch_size)) for values in drawn[:5])):
             yield ReplayBufferSamples(*rows)
 
     def critic_loss(self, batch: ReplayBufferSamples, ent_coef: th.Tensor) -> th.Tensor:

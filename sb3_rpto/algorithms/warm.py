@@ -61,7 +61,8 @@ def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
     if not isinstance(source_model, str | os.PathLike):
         raise TypeError(f"source_model must be a SAC or the path of its zip, not {type(source_model).__name__}")
     try:
-        sac = SAC.load(source_model, device=device)
+        # Its seed is that of its own training, and SB3 would seed the whole process with it.
+        sac = SAC.load(source_model, device=device, custom_objects={"seed": None})
         if not isinstance(sac.policy, SACPolicy):  # TQC's zips have all that SAC asks for
             raise TypeError(f"its policy is a {type(sac.policy).__name__}")
         return sac

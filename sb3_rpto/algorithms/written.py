@@ -230,7 +230,8 @@ def _is_chain(layers: nn.Module, end: int) -> bool:
 def _learns(optimizer: th.optim.Optimizer, parameters: list[nn.Parameter]) -> bool:
     stepped = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     same = len(stepped) == len(parameters) and all(a is b for a, b in zip(stepped, parameters))
-    return same and all(parameter.requires_grad for parameter in parameters)
+    hooked = any(p._backward_hooks or p._post_accumulate_grad_hooks for p in parameters)
+    return same and not hooked and all(parameter.requires_grad for parameter in parameters)
 
 
 def _linears(layers: nn.Module) -> list[nn.Linear]:

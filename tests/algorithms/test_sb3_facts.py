@@ -537,6 +537,19 @@ def test_without_a_seed_nothing_is_seeded(cls, monkeypatch):
     assert len(seeded) >= 2
 
 
+def test_a_zip_that_was_trained_with_a_seed_seeds_nothing(tmp_path, monkeypatch):
+    SAC("MlpPolicy", pendulum(), seed=1, policy_kwargs={"net_arch": [8]}, buffer_size=10).save(tmp_path / "sac")
+    seeded = []
+    monkeypatch.setattr("stable_baselines3.common.base_class.set_random_seed", lambda *args, **kw: seeded.append(args))
+    model = RPO.from_source(tmp_path / "sac", pendulum(), pendulum(12.0))
+    assert seeded == []
+    assert model.seed is None
+
+
+def test_counts_of_numpy_are_counts():
+    build(RPO, batch_size=np.int64(8), gradient_steps=np.int64(1)).learn(10, source_timesteps=0)
+
+
 def test_a_vec_env_wrapper_hands_the_seed_on():
     venv = make_vec_env(pendulum, n_envs=2)
     assert VecEnvWrapper.seed is not type(venv).seed

@@ -81,6 +81,14 @@ def _hook(model):
     model.actor.latent_pi[0].register_forward_hook(lambda *seen: None)
 
 
+def _gradient_hook(model):
+    model.actor.mu.weight.register_hook(lambda gradient: None)
+
+
+def _accumulated_hook(model):
+    model.critic.q_networks[1][0].bias.register_post_accumulate_grad_hook(lambda parameter: None)
+
+
 def _own_layer(model):
     model.actor.mu = nn.Sequential(model.actor.mu)
 
@@ -89,7 +97,7 @@ def _turned(model):
     model.critic.optimizer.param_groups[0]["params"].reverse()
 
 
-@pytest.mark.parametrize("change", [_freeze, _hook, _own_layer, _turned])
+@pytest.mark.parametrize("change", [_freeze, _hook, _gradient_hook, _accumulated_hook, _own_layer, _turned])
 def test_networks_that_were_changed_go_through_autograd(change):
     model = small(RPO)
     assert are_usual(model)
@@ -134,3 +142,74 @@ def test_losses_put_in_place_of_a_models_are_what_is_descended(monkeypatch):
     monkeypatch.setattr(model, "critic_loss", lambda *given: (asked.append(1), RPO.critic_loss(model, *given))[1])
     model.learn(64, source_timesteps=0)
     assert len(asked) == model._n_updates > 0
+
+
+def learned():
+    """A model that has begun to learn, so that its optimizers have their state."""
+    return small(RPO).learn(24, source_timesteps=0)
+
+
+def weights(*modules):
+    return [parameter.detach().clone() for module in modules for parameter in module.parameters()]
+
+
+@pytest.mark.parametrize("network", ["actor", "critic"])
+@pytest.mark.parametrize("begun", [False, True])
+def test_frozen_layers_stay_and_the_rest_learns(network, begun):
+    model = learned() if begun else small(RPO)
+    layers = [layer for layer in getattr(model, network).modules() if isinstance(layer, nn.Linear)]
+    layers[0].requires_grad_(False)
+    frozen, rest = weights(layers[0]), weights(*layers[1:])
+    model.learn(24, source_timesteps=0, reset_num_timesteps=False)
+    assert all(map(th.equal, frozen, weights(layers[0])))
+    assert not any(map(th.equal, rest, weights(*layers[1:])))
+
+
+class FrozenExtractor(FlattenExtractor):
+    """Features of a network that was trained elsewhere."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self.layer = nn.Linear(self.features_dim, self.features_dim).requires_grad_(False)
+
+    def forward(self, observations):
+        return self.layer(super().forward(observations))
+
+
+def test_features_that_are_given_stay_and_a_frozen_actor_too():
+    model = small(RPO, policy_kwargs={"net_arch": [16], "features_extractor_class": FrozenExtractor})
+    model.actor.requires_grad_(False)
+    stays, moves = weights(model.actor, model.critic.features_extractor), weights(*model.critic.q_networks)
+    model.learn(24, source_timesteps=0)
+    assert all(map(th.equal, stays, weights(model.actor, model.critic.features_extractor)))
+    assert not any(map(th.equal, moves, weights(*model.critic.q_networks)))
+
+
+def test_hooks_of_parameters_act_on_their_gradients():
+    model, seen = learned(), []
+    head = model.actor.mu.weight
+    head.register_hook(lambda gradient: seen.append("before") or 0 * gradient)
+    head.register_post_accumulate_grad_hook(lambda parameter: seen.append(float(parameter.grad.abs().max())))
+    model.actor.optimizer.state[head]["exp_avg"].zero_()
+    before, others = head.detach().clone(), weights(model.actor.latent_pi)
+    model.train(2, 32)
+    assert seen == ["before", 0.0] * 2
+    assert th.equal(head, before)
+    assert not any(map(th.equal, others, weights(model.actor.latent_pi)))
+
+
+@pytest.mark.parametrize("extractor", [FlattenExtractor, OwnExtractor])
+def test_callbacks_see_the_last_gradients(extractor):
+    seen = []
+
+    def norms(values, _):
+        model = values["self"]
+        parameters = [*model.actor.parameters(), *model.critic.parameters()]
+        seen.append([p.grad is not None and bool(p.grad.any()) for p in parameters])
+        return True
+
+    small(RPO, policy_kwargs={"net_arch": [16], "features_extractor_class": extractor}).learn(
+        24, norms, 1, source_timesteps=0
+    )
+    assert all(any(row) for row in seen[-8:])
+    assert sum(seen[-1]) >= len(seen[-1]) - 2  # a unit may be dead
