@@ -178,7 +178,7 @@ class TwoWorlds(PolicySnapshots):
         if self._judged_target or (self.loop is not None and not self.loop.traced):
             return
         self._judged_target = True
-        doubt(self.dynamics, 0.0 if self._keeps_phi() else error)  # which is mostly noise there
+        doubt(self.dynamics, 0.0 if self._keeps_phi() else error, data)  # which is mostly noise there
 
     def _adopt_target_rules(self) -> None:
         """Hopper's healthy heights follow its body, say: phi_0 knew the source's rules, phi shall know the target's.

@@ -25,6 +25,9 @@ from sb3_rpto.tracing.columns import columns_of
 #: A fitted simulator should err by less than this share of a standard one-step change. Shifted tasks end below 0.15
 #: (tests and benchmarks; observation noise of a hundredth included), joints in another order above 0.53.
 LARGE = 0.5
+#: Of an error above so much (smaller ones bias phi little) each undoes more than this share of the one before it where
+#: observations are noisy: half of it. What a simulator lacks lasts, and random forces leave each to itself.
+SMALL, UNDONE = 0.05, 0.35
 #: A known reward is another one where it errs by so much of the rewards' deviation, a float's rounding apart, on more
 #: than this share of all transitions; a termination where it errs on more than this share of what ends by either.
 FAR, ROUNDING, MANY, MOST = 0.1, 1e-3, 0.1, 0.5
@@ -133,11 +136,12 @@ def _joint(name: str | None) -> str:
     return "no further joint" if name is None else f"the joint {name!r}"
 
 
-def doubt(dynamics: Dynamics, error: float) -> None:
+def doubt(dynamics: Dynamics, error: float, data: Transitions) -> None:
     """Warn of what speaks against a simulator that was just fitted.
 
     :param dynamics: after a fit; only MuJoCo simulators are judged
     :param error: its one-step error on D_target
+    :param data: D_target
     """
     if not isinstance(dynamics, PhysicalDynamics | ResidualDynamics):
         return
@@ -145,6 +149,14 @@ def doubt(dynamics: Dynamics, error: float) -> None:
     found = [f"{name} lies at its bound" for name in physical.declared_at_bounds()]
     if error > LARGE:
         found.append(f"the one-step error is still {error:.2g} of a typical step's change")
+    if error > SMALL and physical.undone(data) > UNDONE:
+        warnings.warn(
+            "each one-step error undoes a part of the one before it, as where sensors are noisy (or commands late): "
+            "phi is biased then, by more than its standard errors say; declare fewer numbers, or give "
+            "close_loop=True (or a list of effects to look for, which may be empty), with "
+            "dynamics_kwargs={'observation_noise': ...} where sensors are noisy: its traces reckon with both",
+            stacklevel=3,
+        )
     if found:
         warnings.warn(
             f"after the fit {' and '.join(found)}: do the target's observations hold the model's joints in its "

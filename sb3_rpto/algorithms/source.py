@@ -29,6 +29,9 @@ from sb3_rpto.envs.state import reseed, restore_state, save_state, whereabouts
 
 RolloutStart = Literal["target", "source", "mix"]
 
+#: A branch from a state that a simulator does not know begins elsewhere, unless so many draws find no other.
+REDRAWN = 100
+
 
 class SourceWorld(ABC):
     """The world that step 3 acts in."""
@@ -320,13 +323,23 @@ class BranchSource(SourceWorld):
             n_target = 0  # before the first target transition only the source has states
         pools = []
         if n_target > 0:
-            pools.append(buffer.target.observations[self.target_rows(model, n_target), 0])
+            pools.append(self._known(n_target, lambda k: buffer.target.observations[self.target_rows(model, k), 0]))
         if n > n_target:
-            rows = np.random.randint(len(buffer.source_starts), size=n - n_target)
-            pools.append(buffer.source_starts[rows])
+            rows = len(buffer.source_starts)
+            pools.append(self._known(n - n_target, lambda k: buffer.source_starts[np.random.randint(rows, size=k)]))
         # In turns, so that those which D_source forgets first are of both.
         order = np.argsort(np.concatenate([np.arange(len(pool)) / len(pool) for pool in pools]), kind="stable")
         return np.concatenate(pools)[order]
+
+    def _known(self, n: int, draw: Callable[[int], np.ndarray]) -> np.ndarray:
+        """``n`` observations, drawn again where the dynamics do not know the state: at most :data:`REDRAWN` times."""
+        found = draw(n)
+        for _ in range(REDRAWN):
+            unknown = ~self.dynamics.knows(found)
+            if not unknown.any():
+                break
+            found[unknown] = draw(int(unknown.sum()))
+        return found
 
 
 def sample_policy(model: RelativeUpdate, observations: th.Tensor) -> th.Tensor:

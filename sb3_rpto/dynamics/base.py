@@ -99,6 +99,10 @@ class Dynamics(nn.Module, ABC):
     def error(self, data: Transitions) -> float:
         """Root mean squared one-step error on ``data``, in units of each dimension's standard one-step change."""
 
+    def knows(self, observations: np.ndarray) -> np.ndarray:
+        """Whether the model can step on from each of the raw observations (n, observation_dim), bool (n,)."""
+        return np.ones(len(observations), dtype=bool)
+
     @property
     def attached(self) -> bool:
         """Whether :meth:`step` has all that it needs."""

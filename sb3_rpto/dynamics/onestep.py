@@ -15,7 +15,7 @@ from sb3_rpto.effects import Simulation
 from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.sensors import ago
 from sb3_rpto.effects.simulation import Drive
-from sb3_rpto.envs.observations import StateMap
+from sb3_rpto.envs.observations import StateMap, known_at_rest
 
 #: Commands from before a transition, for delays and filters, in s, and at least of so many transitions.
 MEMORY, FILTERED = 0.2, 10
@@ -108,7 +108,7 @@ def as_steps(
     observations, next_observations, actions = (a.cpu().numpy().astype(np.float64) for a in arrays)
     now, then = recover(observations[chosen]), recover(next_observations[chosen])
     known = np.concatenate([now.known_qpos & then.known_qpos, now.known_qvel & then.known_qvel], axis=1)
-    ever = known.any(axis=0) | _known_at_rest(recover)
+    ever = known.any(axis=0) | known_at_rest(recover)
     kept = np.flatnonzero(known[:, ever].all(axis=1))
     rows = chosen[kept]
     commands = np.clip(actions, *command_limits(model))
@@ -130,13 +130,6 @@ def as_steps(
 def remembered(model: mujoco.MjModel, frame_skip: int) -> int:
     """Transitions before one whose commands may still act in it."""
     return max(FILTERED, -(-round(MEMORY / float(model.opt.timestep)) // frame_skip))
-
-
-def _known_at_rest(recover: StateMap) -> np.ndarray:
-    """Which positions and velocities an observation tells of while no speed is at its bound, (nq + nv,)."""
-    with np.errstate(all="ignore"):
-        rest = recover(np.zeros((1, recover.width)))
-    return np.concatenate([rest.known_qpos[0], rest.known_qvel[0]])
 
 
 def _history(commands: np.ndarray, before: np.ndarray, rows: np.ndarray, earlier: int, idle: bool) -> np.ndarray:

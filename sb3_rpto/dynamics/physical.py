@@ -27,7 +27,8 @@ from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.copies import copy_env
-from sb3_rpto.envs.observations import StateMap, noise_of_each, single_env, whole_state
+from sb3_rpto.envs.observations import StateMap, are_known, noise_of_each, single_env, whole_state
+from sb3_rpto.envs.steps import place_as_after_a_step
 
 #: A fit stops when no parameter moves by more than this share of its scale.
 STILL = 1e-6
@@ -125,7 +126,12 @@ class PhysicalDynamics(Dynamics):
         self._unseen: tuple[str, ...] = ()
         self._entangled: tuple[str, ...] = ()
         known: list[Effect] = [*declare(model, declared)]
-        self._adopt([*known, *map(from_json, effects)])
+        every = [*known, *map(from_json, effects)]
+        labels = [effect.label for effect in every]
+        twice = [label for label in dict.fromkeys(labels) if labels.count(label) > 1]
+        if twice:
+            raise ValueError(f"effects: {twice[0]!r} is there twice, and would act twice; leave one of them out")
+        self._adopt(every)
 
     def _adopt(self, effects: Sequence[Effect], covariance: np.ndarray | None = None) -> None:
         """Let phi be the values of these effects, with their covariance (p, p); None: all zero."""
@@ -250,6 +256,10 @@ class PhysicalDynamics(Dynamics):
         """Labels of the effects that remember: commands and states from before a step count as the same."""
         return [effect.label for effect in self.effects() if effect.remembers]
 
+    def knows(self, observations: np.ndarray) -> np.ndarray:
+        """As in :class:`~sb3_rpto.dynamics.base.Dynamics`: a speed at its observation's bound is not known."""
+        return are_known(self.recover, observations.astype(np.float64))
+
     @property
     def attached(self) -> bool:
         """Whether :meth:`attach` was called."""
@@ -287,7 +297,7 @@ class PhysicalDynamics(Dynamics):
         for q, v, action in zip(qpos, qvel, actions.cpu().numpy()):
             twin.reset()
             base.set_state(q, v)  # type: ignore[attr-defined]
-            _place_as_after_a_step(base.model, base.data)  # type: ignore[attr-defined]
+            place_as_after_a_step(base.model, base.data)  # type: ignore[attr-defined]
             twin.forget_commands()
             observation, reward, terminated, _, _ = twin.step(action)
             following.append(observation)
@@ -315,6 +325,20 @@ class PhysicalDynamics(Dynamics):
         reached = np.where(np.isfinite(reached), reached, begun + BLOWN * np.where(shown, steps.scale, 0.0))
         before, predicted, after = (th.as_tensor(x[:, shown]) for x in (begun, reached, steps.reached))
         return relative_error(predicted, Transitions(before, before, before, after, before))
+
+    def undone(self, data: Transitions) -> float:
+        """Share of the typical one-step error that the next one undoes: about 0.5 where observations are noisy.
+
+        :param data: transitions, oldest first
+        :return: of the position or velocity where it is largest; 0 where fewer than 80 follow on others
+        """
+        steps = self._steps(data)
+        after = np.flatnonzero(steps.before >= 0)
+        if len(after) < 80:
+            return 0.0
+        off = (steps.reach(self.simulation, self.values[None])[0] - steps.reached)[:, steps.compared]
+        now, past = off[after], off[steps.before[after]]
+        return float(-np.min((now * past).mean(axis=0) / np.maximum((off**2).mean(axis=0), 1e-300)))
 
     def _steps(self, data: Transitions, chosen: np.ndarray | None = None) -> Steps:
         idle = any(effect.idle for effect in self.simulation.effects)
@@ -405,20 +429,6 @@ class PhysicalDynamics(Dynamics):
 
     def _which(self, marked: np.ndarray) -> tuple[str, ...]:
         return tuple(self.names[i] for i in np.flatnonzero(marked))
-
-
-def _place_as_after_a_step(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Let bodies be where MuJoCo leaves them within an episode: where they were before the last step of the simulation.
-
-    A reward may be told by how far one has come in a step (Ant's is). The fourth-order method leaves them in place.
-    """
-    if model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4):
-        return
-    now = data.qpos.copy()
-    mujoco.mj_integratePos(model, data.qpos, data.qvel, -model.opt.timestep)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    data.qpos[:] = now
 
 
 def _warn_of_new(names: tuple[str, ...], known: tuple[str, ...], message: str) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
@@ -124,6 +125,10 @@ class ResidualDynamics(Dynamics):
         return self.physical.describe()
 
     # ------------------------------------------------------------------ prediction
+
+    def knows(self, observations: np.ndarray) -> np.ndarray:
+        """As in :class:`~sb3_rpto.dynamics.physical.PhysicalDynamics`."""
+        return self.physical.knows(observations)
 
     @th.no_grad()
     def step(self, observations: th.Tensor, actions: th.Tensor, deterministic: bool = False) -> Prediction:

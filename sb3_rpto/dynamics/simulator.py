@@ -81,9 +81,9 @@ def check_memoryless(env: gym.Env, recover: StateMap) -> None:
     if found is not None:
         raise ValueError(
             f"{env_name(env)}: after a step {found} depends on more than the state before it (a goal that is drawn at "
-            "a reset?), which single steps from recorded states would lack; make it a part of the model that is "
-            "observed, or use dynamics='physical' without weighting='value_aware', which simulates whole episodes, or "
-            "dynamics='ensemble'"
+            "a reset, an action before, the time?), which single steps from recorded states would lack; make it a part "
+            "of the model that is observed, or use dynamics='physical' without weighting='value_aware', which "
+            "simulates whole episodes, or dynamics='ensemble'"
         )
 
 

@@ -318,8 +318,11 @@ def register(effect: type[Effect]) -> type[Effect]:
 def from_json(stored: Mapping[str, Any]) -> Effect:
     """The effect that :meth:`Effect.to_json` described.
 
+    :raises TypeError: it is no description
     :raises ValueError: no effect of that kind is registered, or the description is not whole
     """
+    if not isinstance(stored, Mapping):
+        raise TypeError(f"{stored!r} is no description of an effect; pass what its to_json() returns")
     lacks = {"kind", "on", "values"} - set(stored)
     if lacks:
         raise ValueError(

@@ -122,6 +122,20 @@ def register_state_map(env: str | type[gym.Env], make: Callable[[gym.Env], Recov
     _registered[env] = make
 
 
+def known_at_rest(recover: StateMap) -> np.ndarray:
+    """Which positions and velocities an observation tells of while no speed is at its bound, (nq + nv,)."""
+    with np.errstate(all="ignore"):
+        rest = recover(np.zeros((1, recover.width)))
+    return np.concatenate([rest.known_qpos[0], rest.known_qvel[0]])
+
+
+def are_known(recover: StateMap, observations: np.ndarray) -> np.ndarray:
+    """Whether of the states behind observations (n, width) all is known that these ever tell: no speed at its bound."""
+    states = recover(observations)
+    known = np.concatenate([states.known_qpos, states.known_qvel], axis=1)
+    return np.asarray(known[:, known_at_rest(recover)].all(axis=1))
+
+
 def noise_of_each(noise: float | Sequence[float] | np.ndarray, recover: StateMap, name: str = "noise") -> np.ndarray:
     """Standard deviation of each observation's noise, (width,), from one for each or for all.
 

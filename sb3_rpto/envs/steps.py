@@ -14,7 +14,7 @@ from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.engine import quiet
 from sb3_rpto.effects.model import differing
 from sb3_rpto.envs.copies import copy_env
-from sb3_rpto.envs.observations import StateMap, layers
+from sb3_rpto.envs.observations import StateMap, are_known, layers
 
 #: Episodes, and steps of each, that are compared with MuJoCo alone: what remembers shows after the first.
 TRIED, FOLLOWED = 3, 4
@@ -22,13 +22,16 @@ TRIED, FOLLOWED = 3, 4
 KNOWN = ("qpos", "qvel", "act", "history", "qacc_warmstart")
 #: Episodes and steps of each whose states are compared with what the observations are said to show.
 SHOWN, STEPS = 3, 10
-#: Episodes whose first steps are compared with those of others; more than noise tells them apart where they differ by
-#: this many times as much as steps of one episode.
+#: Episodes of which a step is compared with those of others; more than noise tells them apart where they differ by this
+#: many times as much as steps of one episode.
 EPISODES, BEYOND = 8, 3.0
 #: A coordinate is wrong where it is off by more than this share of how far the coordinate moves, and by this much.
 OFF, LEAST = 0.5, 1e-3
 #: It is wrong, too, where its zero is off by more than this share, or its scale, and by more than noise lets them.
 SYSTEMATIC = 0.05
+#: An answer depends on more than a state where it differs by this share of how far answers do. Rewards of Ant differ by
+#: a tenth on the ground: they are told by where the last stage of Runge and Kutta's method leaves its torso.
+MEANT = 0.2
 #: Fields that say where things are, or how they look.
 PLACES = re.compile(r"(body|geom|site|cam|light)_(pos|quat|rgba|dir|poscom0|pos0|mat0)|(mat|tex|vis|stat)[._].*")
 
@@ -185,14 +188,38 @@ def observe(env: gym.Env, qpos: np.ndarray, qvel: np.ndarray, command: np.ndarra
     return np.array(observation)
 
 
+def place_as_after_a_step(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Let bodies be where MuJoCo leaves them within an episode: where they were before the last step of the simulation.
+
+    A reward may be told by how far one has come in a step (Ant's is). The fourth-order method leaves them about there,
+    by its last stage, which no state tells.
+    """
+    if model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4):
+        return
+    now = data.qpos.copy()
+    mujoco.mj_integratePos(model, data.qpos, data.qvel, -model.opt.timestep)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    data.qpos[:] = now
+
+
 def odd_memory(env: gym.Env, recover: StateMap) -> str | None:
     """What a step answers from more than the state that was observed before it; None where nothing is found.
 
-    The first steps of episodes are compared with those from the same states in other episodes: a goal, say, that a
-    reset draws and keeps beside the model is another one there. What differs as much within one is noise.
+    Steps of episodes are compared with first steps from the same states in other episodes: a goal, say, that a reset
+    draws and keeps beside the model is another one there, and later so are the time and the action before.
 
     :param env: a MuJoCo environment; untouched
     :param recover: states from its observations
+    """
+    return _odd_answer(env, recover, later=False) or _odd_answer(env, recover, later=True)
+
+
+def _odd_answer(env: gym.Env, recover: StateMap, later: bool) -> str | None:
+    """The first answer to the first steps of episodes, or to ``later`` ones, that differs by more than noise.
+
+    First steps are repeated in the same episode, where a goal is the same: what differs then is noise. Later ones are
+    repeated in another one, so that nothing comes before.
     """
     one, other = copy_env(env), copy_env(env)
     if one is None or other is None:
@@ -203,23 +230,38 @@ def odd_memory(env: gym.Env, recover: StateMap) -> str | None:
     answers = []
     for seed in range(EPISODES):
         observation, _ = one.reset(seed=seed)
-        other.reset(seed=EPISODES + seed)
-        states, data = recover(np.asarray(observation, dtype=float)[None]), first.data
+        for _ in range((1 + seed) * later):
+            following, _, *ended, _ = one.step(one.action_space.sample())
+            if any(ended):
+                observation, _ = one.reset(seed=seed)
+                break
+            observation = following
+        seen = np.asarray(observation, dtype=float)[None]
+        if not are_known(recover, seen)[0]:
+            continue
+        states, data = recover(seen), first.data
         qpos, qvel = np.nan_to_num(states.qpos[0]), np.nan_to_num(states.qvel[0])
         # Again from as far on the other side of the true state: off by noise, in the observation before the step, too.
         mirrored = (
             np.where(states.known_qpos[0], 2 * data.qpos - qpos, qpos),
             np.where(states.known_qvel[0], 2 * data.qvel - qvel, qvel),
         )
-        action = one.action_space.sample()
-        stepped = [one.step(action)]
-        for state in ((qpos, qvel), mirrored):
+        under_way, action = bool(data.time > 0), one.action_space.sample()
+        stepped, over = [one.step(action)], True
+        for k, state in enumerate(((qpos, qvel), mirrored), 1):
+            if later or over:
+                other.reset(seed=EPISODES * (k if later else 1) + seed)
             base.set_state(*state)
+            if under_way:
+                place_as_after_a_step(base.model, base.data)
             stepped.append(other.step(action))
+            over = any(stepped[-1][2:4])
         answers.append([[*observation, reward] for observation, reward, *_ in stepped])
+    if not answers:
+        return None
     true, found, again = np.array(answers, dtype=float).transpose(1, 0, 2)
     off, noise = (np.sqrt(((found - against) ** 2).mean(axis=0)) for against in (true, again))
-    wrong = off > np.maximum(np.maximum(OFF * true.std(axis=0), LEAST), BEYOND * noise)
+    wrong = off > np.maximum(np.maximum(MEANT * true.std(axis=0), LEAST), BEYOND * noise)
     if not wrong.any():
         return None
     column = int(np.flatnonzero(wrong)[0])

@@ -114,6 +114,17 @@ def test_branches_start_where_it_was_asked_for(start: str, of_target: Any) -> No
         assert len(begun) > 30 or len(begun) == 0  # anywhere, not at the first ones
 
 
+@pytest.mark.parametrize("start", ["target", "source", "mix"])
+def test_branches_start_where_the_model_knows_the_state_if_there_is_such_a_place(
+    start: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = algorithm()
+    monkeypatch.setattr(Push, "knows", lambda self, observations: np.abs(observations[:, 1]) < 0.6)
+    assert (np.abs(branches(made, 150, start)["observations"][:, 1]) < 0.6).all()
+    monkeypatch.setattr(Push, "knows", lambda self, observations: np.zeros(len(observations), dtype=bool))
+    assert len(branches(algorithm(), 20, start)["observations"]) == 20
+
+
 def test_single_branches_are_mixed_too_and_of_more_than_fit_all_are_of_both() -> None:
     made = algorithm()
     source = BranchSource(Push(made.observation_space, made.action_space), "mix")
@@ -183,7 +194,7 @@ def simulators(randomise: float) -> RPTO:
     )
     made.learn(1, source_timesteps=40)
     (mass,) = made.dynamics.effects()  # type: ignore[union-attr]
-    made.dynamics.replace([mass], {mass.label: 0.1 * mass.values})  # type: ignore[union-attr]
+    made.dynamics.replace([mass], (0.1 * mass.values[:, None]) ** 2)  # type: ignore[union-attr]
     return made
 
 
@@ -225,7 +236,7 @@ def test_a_walker_of_an_episode_of_its_own_stands_as_it_is_then() -> None:
     )
     dynamics.seed(0)
     (leg,) = dynamics.effects()
-    dynamics.replace([leg], {leg.label: np.array([0.03])})
+    dynamics.replace([leg], np.array([[0.03**2]]))
     source = SimulatorSource(dynamics, env, 3)
     seen = set()
     for _ in range(3):

@@ -16,10 +16,11 @@ import torch as th
 from gymnasium import spaces, wrappers
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
-from shifted import HOPPER, POLE, POLES, SHIFTS, collect, joined, noisy, shifted
+from shifted import HOPPER, POLE, POLES, SHIFTS, collect, joined, noisy, observed, shifted
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPTO
+from sb3_rpto.algorithms.machine import doubt
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.env import DynamicsEnv
 from sb3_rpto.dynamics.physical import PhysicalDynamics
@@ -633,6 +634,47 @@ def test_a_goal_that_each_reset_draws_is_refused_where_single_steps_would_lack_i
     RPTO("MlpPolicy", **worlds, dynamics="physical", **settings).learn(4, source_timesteps=0)
 
 
+class Remembering(InvertedPendulumEnv):
+    """Told of a change of its action, or of the time, or showing it."""
+
+    what, before = "", 0.0
+
+    def __init__(self, what):
+        super().__init__()
+        self.what = what
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (4 + (what == "clock"),), np.float64)
+
+    def reset_model(self):
+        self.before = 0.0
+        return super().reset_model()
+
+    def _get_obs(self):
+        return np.concatenate([self.data.qpos, self.data.qvel, [self.data.time] * (self.what == "clock")])
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        change, self.before = float(action[0]) - self.before, float(action[0])
+        told = {"rate": 0.1 * change**2, "time": (observation[0] - np.sin(9 * self.data.time)) ** 2}
+        return observation, reward - told.get(self.what, observation[0] ** 2), *rest
+
+
+@pytest.mark.parametrize(
+    ("what", "named"), [("rate", "the reward"), ("time", "the reward"), ("clock", r"observation\[4\]"), ("none", None)]
+)
+def test_actions_before_and_the_time_are_more_than_the_state(what, named):
+    def recover(obs):
+        known = np.ones((len(obs), 2), dtype=bool)
+        return States(obs[:, :2], obs[:, 2:4], known, known)
+
+    register_state_map(Remembering, lambda env: recover)
+    env = Remembering(what)
+    if named is None:
+        check_memoryless(env, state_map(env))
+    else:
+        with pytest.raises(ValueError, match=f"after a step {named} depends on more .*an action before, the time"):
+            check_memoryless(env, state_map(env))
+
+
 @pytest.mark.parametrize("noise", [0.0005, 0.005, 0.05])
 def test_observations_that_are_noisier_than_resets_are_no_goal(noise):
     class Noisy(HopperEnv):
@@ -643,6 +685,42 @@ def test_observations_that_are_noisier_than_resets_are_no_goal(noise):
 
     env = Noisy()
     check_memoryless(env, state_map(gym.make(HOPPER)))
+
+
+@pytest.mark.parametrize(
+    ("change", "noisy_sensors"),
+    [
+        (lambda data: observed(data, 5e-3, 0), True),
+        (lambda data: noisy(data, 2e-2), False),
+        (lambda data: data, False),  # the pole has twice the mass, which no damping tells
+    ],
+)
+def test_observations_that_err_are_told_from_what_a_simulator_lacks(change, noisy_sensors):
+    data = change(collect(shifted(POLE, {"pole.mass": 10.0}), 200, scale=1.0))
+    model = dynamics(POLE, ["hinge.damping"])
+    model.fit(data)
+    assert model.error(data) > 0.05
+    assert (0.4 < model.undone(data) < 0.7) if noisy_sensors else (model.undone(data) < 0.25)
+    said = pytest.warns(UserWarning, match="undoes a part of the one before it") if noisy_sensors else nullcontext()
+    with warnings.catch_warnings(), said:
+        warnings.simplefilter("default" if noisy_sensors else "error")
+        doubt(model, min(model.error(data), 0.4), data)
+    assert model.undone(data.take(slice(60))) == 0
+
+
+def test_an_effect_is_there_once_and_described():
+    drag = LIBRARY["quadratic_drag"]("slider", coefficient=8.0)
+    with pytest.raises(ValueError, match=r"effects: 'quadratic_drag\(slider\)' is there twice, and would act twice"):
+        dynamics(POLE, [], effects=[drag.to_json(), {**drag.to_json(), "values": {"coefficient": 1.0}}])
+    with pytest.raises(TypeError, match=r"is no description of an effect; pass what its to_json\(\) returns"):
+        dynamics(POLE, [], effects=[drag])
+
+
+def test_a_speed_at_its_observations_bound_is_not_known():
+    model = dynamics(HOPPER)
+    observations = np.zeros((3, 11))
+    observations[1, 5], observations[2, 8] = 10.0, -10.0
+    assert model.knows(observations).tolist() == [True, False, False]
 
 
 class Tracking(InvertedPendulumEnv):
