@@ -331,7 +331,10 @@ class Switch:
 def memory(model: mujoco.MjModel) -> float:
     """Seconds of past commands that the model's own actuators remember, by filters and delays."""
     filters = np.isin(model.actuator_dyntype, FILTERS)
-    own = CONSTANTS * model.actuator_dynprm[filters, 0]
+    muscles = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE
+    # The times in which a muscle activates and relaxes are up to twice its constants, by how active it is.
+    slowest = np.where(muscles, 2 * model.actuator_dynprm[:, :2].max(axis=1), model.actuator_dynprm[:, 0])
+    own = CONSTANTS * slowest[filters]
     return max(float(own.max(initial=0.0)), float(model.actuator_delay.max(initial=0.0)))
 
 
@@ -343,7 +346,9 @@ def settled(model: mujoco.MjModel, ctrl: np.ndarray) -> np.ndarray:
     """
     act, sent = np.zeros((len(ctrl), model.na)), np.clip(ctrl, *command_limits(model))
     for i in np.flatnonzero(np.isin(model.actuator_dyntype, FILTERS)):
-        act[:, model.actuator_actadr[i]] = sent[:, model.actuator_ctrladr[i]]
+        held = sent[:, model.actuator_ctrladr[i]]
+        muscle = model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_MUSCLE
+        act[:, model.actuator_actadr[i]] = np.clip(held, 0.0, 1.0) if muscle else held
     return act
 
 
@@ -352,9 +357,7 @@ def names_of(model: mujoco.MjModel, qpos: Sequence[str]) -> np.ndarray:
     joints = object_names(model, "joint")
     addresses = []
     for name in qpos:
-        joint, _, offset = name.rpartition(".")
-        if joint in joints and offset.isdigit():
-            addresses.append(int(model.jnt_qposadr[joints.index(joint)]) + int(offset))
-        else:
-            addresses.append(int(model.jnt_qposadr[joints.index(name)]))
+        # A joint may be called hinge.001 beside another hinge.
+        joint, offset = (name, "0") if name in joints else (name[:-2], name[-1])
+        addresses.append(int(model.jnt_qposadr[joints.index(joint)]) + int(offset))
     return np.array(addresses, dtype=int)

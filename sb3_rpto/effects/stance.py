@@ -22,7 +22,7 @@ class Stance:
 
     Its lowest point at reset keeps its distance from the floor, and ``_healthy_z_range``, where the task has one, keeps
     its proportion to the height of the root body over that lowest point. Tasks without a vertical coordinate or a floor
-    are left alone.
+    are left alone, and so is what hangs or falls: farther above the floor than its root body is above its lowest point.
 
     :param base: an unwrapped gymnasium MuJoCo environment, as it stands before
     :param before: :func:`nominal_heights` of the model before, where that of ``base`` has changed already; of use where
@@ -35,7 +35,7 @@ class Stance:
         found = None if self._joint is None else _heights(base.model, self._joint, base.init_qpos)
         if found is not None and before is not None and np.allclose(base.init_qpos, base.model.qpos0):
             found = before
-        if found is None:
+        if found is None or found[0] > found[1]:
             self._joint = None
             return
         self._qpos = base.init_qpos.copy()
@@ -89,7 +89,11 @@ def nominal_heights(model: mujoco.MjModel) -> tuple[float, float] | None:
 
 
 def _vertical(model: mujoco.MjModel) -> int | None:
-    """The joint that holds the height of a body in the world: a free joint, or a slide along z; None without."""
+    """The joint that holds the height of the machine in the world: a free joint, or a slide along z; None without.
+
+    Of several such bodies the machine is the one that moves the most joints: a ball beside it has none of its own.
+    """
+    found = {}
     for joint in range(model.njnt):
         body = int(model.jnt_bodyid[joint])
         if model.body_parentid[body] != 0:
@@ -98,8 +102,8 @@ def _vertical(model: mujoco.MjModel) -> int | None:
             model.body_quat[body], (1, 0, 0, 0)
         )
         if model.jnt_type[joint] == _FREE or (model.jnt_type[joint] == _SLIDE and upright):
-            return joint
-    return None
+            found[joint] = int((model.body_rootid[model.jnt_bodyid] == body).sum())
+    return max(found, key=found.__getitem__, default=None)
 
 
 def _address(model: mujoco.MjModel, joint: int) -> int:

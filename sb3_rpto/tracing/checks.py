@@ -27,6 +27,8 @@ CLEAR = 0.5
 """Another convention of rotations fits clearly when it leaves at most so much of what MuJoCo's leaves."""
 TURN, FAST = 2 * np.pi, 0.05
 """A turn in rad; an angle is too fast for its samples where more than this share of its steps are about half a turn."""
+JUMP, RARE = 8.0, 0.02
+"""A step is no motion where it is so many times faster than all others, and at most this share of them are."""
 WINDOW = 9
 """Samples of the filter that differentiates positions."""
 
@@ -115,6 +117,25 @@ def unwrap(angle: np.ndarray, change: np.ndarray | None = None) -> tuple[np.ndar
             jumps, fast = np.where(unsure, told, jumps), False
     count = int(np.count_nonzero(jumps))
     return angle - TURN * np.concatenate([[0.0], np.cumsum(jumps)]) if count else angle, count, fast
+
+
+def jumps(time: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Steps of a position that are no motion: few, single, and much larger than all others of their time, (T - 1,).
+
+    :param time: increasing times in s, shape (T,)
+    :param position: in rad or m, shape (T,)
+    :return: whether each step is one
+    """
+    speed = np.abs(np.diff(position)) / np.diff(time)
+    falling = np.sort(speed)[::-1]
+    most = max(1, int(RARE * len(speed)))
+    larger, smaller = falling[:most], falling[1 : most + 1]
+    if len(smaller) < most or not (moving := smaller > 0).any():
+        return np.zeros(len(speed), dtype=bool)
+    apart = np.where(moving, larger / np.where(moving, smaller, 1.0), 0.0)
+    found = speed > smaller[int(np.argmax(apart))]
+    single = not (found[1:] & found[:-1]).any()
+    return found if apart.max() > JUMP and single else np.zeros_like(found)
 
 
 def align_quaternions(quaternions: np.ndarray) -> int:

@@ -90,7 +90,7 @@ def _is_number(value: object) -> bool:
         float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return False
-    return True
+    return "_" not in str(value)  # Python reads 1_0 as 10
 
 
 def runs_of(file: str, table: Table) -> dict[str | None, dict[str, np.ndarray]]:
@@ -345,6 +345,15 @@ def _unwrap_angles(episode: Episode, columns: Columns, tell: _Tell) -> None:
         if fast:
             message = "many steps are of about half a turn, so whole turns may be lost: sample faster, or give qvel"
             tell("fast angle", message, f"qpos.{name}")
+        leaps = np.abs(np.diff(episode.qpos[:, i])[checks.jumps(episode.time, episode.qpos[:, i])])
+        if len(leaps):
+            most = f"{leaps.max():.3g}"
+            sizes = most if np.ptp(leaps) < 0.05 * leaps.max() else f"{leaps.min():.3g} to {most}"
+            message = (
+                f"{len(leaps)} step(s) of {sizes} from a sample to the next, far faster than all others; kept: unwrap "
+                "the encoder at its own period, or split the run where it was moved by hand or set anew"
+            )
+            tell("jump", message, f"qpos.{name}")
 
 
 def _complete_velocities(episode: Episode, columns: Columns, tell: _Tell) -> None:

@@ -108,10 +108,11 @@ def _check_actuators(model: mujoco.MjModel) -> None:
         count, dynamics = model.actuator_ctrlnum[i], int(model.actuator_dyntype[i])
         if count != 1:
             raise ValueError(f"actuator {name!r} takes {count} commands; traced are those of one, such as <position>")
-        if dynamics not in _KNOWN_DYNAMICS:
-            kind = mujoco.mjtDyn(dynamics).name.removeprefix("mjDYN_").lower()
+        known = dynamics in _KNOWN_DYNAMICS
+        if not known or model.actuator_actnum[i] > (dynamics in FILTERS):
+            kind = "of a plugin" if known else f"dyntype {mujoco.mjtDyn(dynamics).name.removeprefix('mjDYN_').lower()}"
             raise ValueError(
-                f"actuator {name!r} has a state of its own (dyntype {kind}) that no column holds and no commands tell; "
+                f"actuator {name!r} has a state of its own ({kind}) that no column holds and no commands tell; "
                 "model it without, and give what it puts out as its command"
             )
 

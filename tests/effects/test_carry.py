@@ -329,6 +329,18 @@ def test_what_stands_does_so_by_its_own_lowest_point_over_the_floor(wall, tmp_pa
     assert heights == pytest.approx([0.2, 0.2, 0.2 + 0.2 * 0.15])
 
 
+BALL = '<body name="ball" pos="2 0 .1"><freejoint/><geom type="sphere" size=".1"/></body>'
+
+
+def test_the_machine_stands_whatever_lies_beside_it_and_what_hangs_is_left_there(tmp_path):
+    world = WORLD.format(wall="").replace('<body name="arm"', BALL + '<body name="arm"')
+    hanging = WORLD.format(wall="").replace("1 0 .2", "1 0 .9")
+    for xml, start in ((world, 0.2 + 0.2 * 0.15), (hanging, 0.9)):
+        (tmp_path / "world.xml").write_text(xml)
+        base = StandingEnv(Standing(str(tmp_path / "world.xml")), [LinkLength("foot", change=0.2)]).unwrapped
+        assert base.init_qpos[base.model.joint(base.model.body("box").jntadr[0]).qposadr[0] + 2] == pytest.approx(start)
+
+
 def test_a_walker_that_begins_in_a_pose_of_its_own_is_left_there(tmp_path):
     from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_rpto.effects import LIBRARY, Drive, Effect, Simulation, declare
-from sb3_rpto.effects.simulation import alike
+from sb3_rpto.effects.simulation import alike, memory, names_of, settled
 from sb3_rpto.effects.world import BatchWorld
 
 XML = """
@@ -234,6 +234,48 @@ def test_commands_before_the_start_fill_delays() -> None:
     got = sim.rollout(np.full((2, 1), 4 * 0.005), qpos, qvel, Drive(commands, before=10))
     np.testing.assert_allclose(got[0], loop(MODEL, qpos, qvel, delayed[:, 10:])[0], rtol=1e-9, atol=1e-12)
     assert got[0].shape == (2, 111, 2)
+
+
+MUSCLES = "".join(
+    f'<muscle name="{name}" joint="elbow" force="6" gear="{gear}" lengthrange="-2 2" timeconst="0.01 0.04"/>'
+    for name, gear in (("flex", 1), ("extend", -1))
+)
+
+
+def test_muscles_remember_until_they_have_relaxed_and_hold_no_more_than_they_have() -> None:
+    """Twice the time constant at most, as they relax from nothing on, or activate where they nearly are."""
+    model = mujoco.MjModel.from_xml_string(XML.replace("ACTUATORS", MUSCLES))
+    lead, steps = round(memory(model) / model.opt.timestep), 40
+    rng = np.random.default_rng(0)
+    commands = np.repeat(rng.uniform(-0.5, 1.5, (8, 20, 2)), 20, axis=1)
+    _, nu = settled(model, commands[:, -1]).shape
+    assert nu == 2
+    data = mujoco.MjData(model)
+    starts, truth = [], []
+    for u in commands:
+        mujoco.mj_resetData(model, data)
+        for k, command in enumerate(u[: 200 + steps]):
+            if k == 200:
+                starts.append((data.qpos.copy(), data.qvel.copy()))
+            data.ctrl[:] = command
+            mujoco.mj_step(model, data)
+        truth.append(data.qpos.copy())
+    qpos, qvel = (np.array(part) for part in zip(*starts))
+    driven = Drive(commands[:, 200 - lead : 200 + steps], lead)
+    reached, _ = Simulation(model, [], 1).rollout(np.zeros((8, 0)), qpos, qvel, driven)
+    np.testing.assert_allclose(reached[:, -1], truth, atol=1e-5)
+    data.ctrl[:] = -0.8, 3
+    mujoco.mj_step(model, data, nstep=2000)
+    np.testing.assert_allclose(settled(model, data.ctrl[None])[0], data.act, atol=1e-6)
+
+
+@pytest.mark.parametrize("names", [("hinge", "hinge.001"), ("hinge.001", "hinge"), ("a.1", "a")])
+def test_a_joint_may_be_called_as_another_with_a_number_behind(names: tuple) -> None:
+    body = '<body><joint name="{}" axis="0 1 0"/><geom size=".1" pos="0 0 -.1"/></body>'
+    ball = '<body><joint name="ball" type="ball"/><geom size=".1"/></body>'
+    xml = f"<mujoco><worldbody>{ball}{''.join(map(body.format, names))}</worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(xml)
+    assert names_of(model, [*names[::-1], "ball.3"]).tolist() == [5, 4, 3]
 
 
 def test_commands_pass_the_chain_in_its_order() -> None:

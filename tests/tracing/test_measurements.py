@@ -341,6 +341,57 @@ def test_wrapped_angle_is_unwrapped_and_reported():
     np.testing.assert_allclose(data.episodes[0].qpos[:, 0], true, rtol=0, atol=1e-12)
 
 
+TIME = np.arange(1500) * 0.01
+
+
+def rotor(noise=1e-3):
+    return 15 * np.sin(0.4 * TIME) + 0.2 * np.sin(9 * TIME) + noise * np.random.default_rng(0).normal(size=1500)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: (rotor() + 12.5) % 25.0 - 12.5, r"4 step\(s\) of 24.9 from"),
+        (lambda: (rotor() + np.pi / 2) % np.pi - np.pi / 2, r"19 step\(s\) of 3.07 from"),
+        (lambda: rotor() + 2 * np.pi * (TIME > 7.003), r"1 step\(s\) of 6.2"),
+        (lambda: 0.1 * rotor() - 0.8 * (TIME > 3.003) + 0.5 * (TIME > 8.003), r"2 step\(s\) of 0.49\d* to 0.79"),
+    ],
+    ids=["period", "gear", "slip", "set anew"],
+)
+@pytest.mark.parametrize("measured", [False, True])
+def test_steps_that_are_no_motion_are_told(make, said, measured):
+    table = {"time": TIME, "qpos.wheel": make()}
+    if measured:
+        table["qvel.wheel"] = np.gradient(rotor(0.0), 0.01)
+    (found,) = [finding for finding in Measurements.from_tables({"a": table}).findings if finding.kind == "jump"]
+    assert re.match(said, found.message)
+
+
+def bouncing():
+    """A ball on the floor: its velocity jumps, it does not."""
+    fall = TIME % 0.8
+    return 4.905 * fall * (0.8 - fall)
+
+
+@pytest.mark.parametrize(
+    "position",
+    [
+        rotor(),
+        rotor(0.05),
+        np.round(rotor() / 0.01) * 0.01,
+        np.round(0.01 * rotor() / 0.01) * 0.01,  # fifteen counts in all
+        np.repeat(rotor()[::25], 25),
+        np.clip(np.sin(2 * TIME), 0.9, 1),
+        0.2 * np.tanh(30 * (TIME - 3)) + 1e-4 * np.random.default_rng(0).normal(size=1500),
+        bouncing(),
+        np.zeros(1500),
+        np.arange(1500.0),
+    ],
+)
+def test_motion_is_no_jump(position):
+    assert not checks.jumps(TIME, position).any()
+
+
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=50, deadline=None)
 def test_unwrap_restores_any_smooth_angle(seed):

@@ -100,6 +100,19 @@ def test_a_command_flipped_in_all_runs():
     assert "in every run" in finding.message
 
 
+PLUGIN = """<mujoco><extension><plugin plugin="mujoco.pid"><instance name="pid">
+  <config key="kp" value="20"/><config key="ki" value="60"/></instance></plugin></extension>
+  <worldbody><body><joint name="h" axis="0 1 0"/><geom size=".1" pos="0 0 -.1"/></body></worldbody>
+  <actuator><plugin name="p" joint="h" plugin="mujoco.pid" instance="pid" actdim="1"/></actuator></mujoco>"""
+
+
+def test_a_plugin_that_integrates_is_refused():
+    time = np.arange(50) * 0.01
+    data = Measurements.from_tables({"a": {"time": time, "qpos.h": np.sin(time), "ctrl.p": np.cos(time)}})
+    with pytest.raises(ValueError, match=r"actuator 'p' has a state of its own \(of a plugin\) that no column holds"):
+        check_against(mujoco.MjModel.from_xml_string(PLUGIN), data)
+
+
 def with_torque(tables):
     for table in tables.values():
         table["qfrc.elbow"] = table["ctrl.second"].copy()
