@@ -23,16 +23,19 @@ class Descent:
 
     def __init__(self, optimizer: th.optim.Optimizer) -> None:
         self.optimizer = optimizer
-        own = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-        self.parameters = [parameter for parameter in own if parameter.requires_grad]
-        optimizer.zero_grad()  # else a parameter that was frozen since would be stepped down its last gradient
+        self._own = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        self.parameters = [parameter for parameter in self._own if parameter.requires_grad]
         self._plain = _is_plain_adam(optimizer)
         self._state: tuple[list[th.Tensor], ...] = ()
 
+    def forget(self) -> None:
+        """Let go of the last gradients, so that the next ones take their memory, and what is frozen now has none."""
+        for parameter in self._own:
+            parameter.grad = None
+
     def __call__(self, loss: th.Tensor) -> None:
         """One step down the gradient of ``loss``; hooks of the parameters act on it."""
-        for parameter in self.parameters:
-            parameter.grad = None
+        self.forget()
         if self.parameters:
             loss.backward(inputs=self.parameters)
             self.step([parameter.grad for parameter in self.parameters])

@@ -105,6 +105,8 @@ class RelativeUpdate(SAC):
             for first in range(0, gradient_steps, burst):
                 batches = self.sample_batches(min(burst, gradient_steps - first), batch_size)
                 for step, (critic_batch, actor_batch) in enumerate(batches, first):
+                    for descent in filter(None, descents):
+                        descent.forget()
                     for name, loss in update(critic_batch, actor_batch, descents).items():
                         losses.setdefault(name, []).append(loss.detach().reshape(()))
                     if step % self.target_update_interval == 0:
