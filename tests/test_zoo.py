@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -356,6 +357,22 @@ def test_transitions_of_another_world_are_not_taken_into_the_target(zoo, tmp_pat
         model = SAC.load(final(run), device="cpu")
         model.load_replay_buffer(run / "replay_buffer.pkl")
         assert model.replay_buffer.size() == held
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("told", "held"), [(None, 4), (SOURCE, 4), (TARGET, 34)])
+def test_nor_are_those_beside_a_zip_of_another_command(told, held, zoo, tmp_path):
+    short = ["--eval-freq", "-1", "--save-replay-buffer", "-params", "policy_kwargs:dict(net_arch=[16])"]
+    run = final(launch(tmp_path, "sac", "-n", "30", *short, env=SOURCE)).parent
+    (tmp_path / "ours").mkdir()
+    for file, name in ((final(run), "model.zip"), (run / "replay_buffer.pkl", "replay_buffer.pkl")):
+        shutil.copy(file, tmp_path / "ours" / name)
+    if told is not None:
+        (tmp_path / "ours" / "config.json").write_text(json.dumps({"command": "train", "target": told}))
+    run = launch(tmp_path, "sac", "-i", str(tmp_path / "ours" / "model.zip"), "-n", "4", *short, env=TARGET)
+    model = SAC.load(final(run), device="cpu")
+    model.load_replay_buffer(run / "replay_buffer.pkl")
+    assert model.replay_buffer.size() == held
 
 
 def test_a_search_is_judged_on_the_target(zoo, agent, tmp_path, monkeypatch):

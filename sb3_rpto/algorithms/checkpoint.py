@@ -310,6 +310,13 @@ def resume(model: Resumable) -> None:
     _go_on_drawing(model, state)
 
 
+def resume_unbegun(model: Resumable) -> None:
+    """As :func:`resume`, of a trained model that was saved before its first step here: before all that precedes it."""
+    state = model._resume_state
+    if state is not None and state["last_obs"] is None and model._warm and not model._offline:
+        resume(model)
+
+
 def resume_source_phase(model: Resumable) -> None:
     """Go on with the statistics and random streams of a checkpoint of the source phase, in a new episode."""
     state, model._resume_state = model._resume_state, None

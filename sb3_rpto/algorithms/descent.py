@@ -44,7 +44,8 @@ class Descent:
         """One step down gradients that are known, one for each parameter that learns, in the optimizer's order."""
         for parameter, gradient in zip(self.parameters, gradients):
             parameter.grad = gradient
-        begun = len(self.optimizer.state) == len(self.parameters)  # the first step makes the state
+        # The first step of each makes its state.
+        begun = bool(self._state) or all(self.optimizer.state.get(parameter) for parameter in self.parameters)
         if self._plain and begun and all(gradient is not None for gradient in gradients):
             self._step_adam(list(gradients))
         else:

@@ -151,10 +151,10 @@ def doubt(dynamics: Dynamics, error: float, data: Transitions) -> None:
         found.append(f"the one-step error is still {error:.2g} of a typical step's change")
     if error > SMALL and physical.undone(data) > UNDONE:
         warnings.warn(
-            "each one-step error undoes a part of the one before it, as where sensors are noisy (or commands late): "
+            "each one-step error undoes a part of the one before it, as where sensors are noisy: "
             "phi is biased then, by more than its standard errors say; declare fewer numbers, or give "
             "close_loop=True (or a list of effects to look for, which may be empty), with "
-            "dynamics_kwargs={'observation_noise': ...} where sensors are noisy: its traces reckon with both",
+            "dynamics_kwargs={'observation_noise': ...}: its traces reckon with noise",
             stacklevel=3,
         )
     if found:

@@ -31,4 +31,4 @@ def renew_source(model: Looping) -> None:
     assert model._source_world is not None
     model.replay_buffer.source.reset()
     model._source_world.begin_anew()
-    model.source_timesteps += model._source_world.interact(model, FILL)
+    model._source_world.interact(model, FILL)

@@ -72,6 +72,5 @@ def learn_for_a_step(model: Looping, source_steps: int) -> int:
     """Steps 3 (of so many), 5 and 6 of a round with one target step, but for the fit; the number of source steps."""
     assert model._source_world is not None
     taken = model._source_world.interact(model, source_steps)
-    model.source_timesteps += taken
     model.train(model.updates_per_step, model.batch_size)
     return taken

@@ -40,7 +40,7 @@ class SourceWorld(ABC):
     def interact(self, model: RelativeUpdate, n_steps: int) -> int:
         """Take at least ``n_steps`` steps and store every transition.
 
-        :param model: whose policy acts and whose D_source is filled
+        :param model: whose policy acts and whose D_source is filled; its ``source_timesteps`` count them
         :param n_steps: number of transitions
         :return: the number of transitions stored
         """
@@ -147,6 +147,7 @@ class EpisodeSource(SourceWorld):
                     self.lengths.append(info["episode"]["l"])
             self._last_obs = np.asarray(new_obs)
             steps += self.env.num_envs
+            model.source_timesteps += self.env.num_envs  # each as it is taken: the rest may be interrupted
         self._left_at = whereabouts(self.env)
         return steps
 
@@ -304,6 +305,7 @@ class BranchSource(SourceWorld):
         next_obs = next_obs.clip(model.observation_space.low, model.observation_space.high)
         terminations = answer.terminations.cpu().numpy()
         model.replay_buffer.append("source", starts, next_obs, scaled.cpu().numpy(), rewards, terminations)
+        model.source_timesteps += n_steps
         return n_steps
 
     def answer(self, model: RelativeUpdate, observations: th.Tensor, actions: th.Tensor) -> Prediction:

@@ -351,6 +351,7 @@ class TransferAlgorithm(Looping):
         self._store_step_cut_off()
         if reset_num_timesteps and self._warm:  # else the source phase goes on all the same
             checkpoint.leave(self)
+        checkpoint.resume_unbegun(self)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
@@ -411,7 +412,7 @@ class TransferAlgorithm(Looping):
         n_steps = self._collected * self._steps_of_round()
         if self._offline:  # the budget is one of source steps then
             n_steps = min(n_steps, self._steps_left())
-        self.source_timesteps += self._source_world.interact(self, n_steps)
+        self._source_world.interact(self, n_steps)
 
     def interact_with_target(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Step 4: act in the target and fill D_target; SB3's own code collects, within the budget.

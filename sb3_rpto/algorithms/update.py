@@ -53,6 +53,8 @@ class RelativeUpdate(SAC):
     weight_floor: float
     real_ratio: float
     model_train_freq: int
+    #: source steps so far
+    source_timesteps: int
     #: plain SAC in the source is under way
     _pretraining: bool
     #: step 3 of a round is done, its steps 5 and 6 are not

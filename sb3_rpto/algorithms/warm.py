@@ -190,9 +190,9 @@ def _collect_in_source(model: Resumable, n_steps: int) -> None:
         return
     if model.dynamics is not None and model.dynamics.rollout == "episodes":  # phi may have moved: its own source
         assert model._source_world is not None
-        model.source_timesteps += model._source_world.interact(model, n_steps)
+        model._source_world.interact(model, n_steps)
         return
-    model.source_timesteps += EpisodeSource(model.env).interact(model, n_steps)
+    EpisodeSource(model.env).interact(model, n_steps)
     model.env.reset()
 
 
@@ -224,7 +224,6 @@ def _train_in_source(model: Resumable, source_timesteps: int, progress_bar: bool
             explores = model.use_sde and model.use_sde_at_warmup
             steps = source.interact(model, 1, random=warming_up and not explores)
             model._pretrained_steps += steps
-            model.source_timesteps += steps
             # Also where it goes on without its buffers: the policy would be fitted to a handful of transitions.
             if model.replay_buffer.source.size() > model.learning_starts:
                 model.train(steps, model.batch_size)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_rpto.commands import options
+from sb3_rpto.commands.terminal import say
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -228,4 +229,4 @@ def _film(
     ]
     set_random_seed(parsed.seed)
     film(panels, parsed.video, parsed.seconds, parsed.seed)
-    print(f"written: {parsed.video}")
+    say(f"written: {parsed.video}")

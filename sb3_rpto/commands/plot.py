@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_rpto.commands.terminal import say
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -59,7 +61,7 @@ def run(parsed: argparse.Namespace) -> int:
         draw(axes, rows[rows["target"] == panel], panel)
     form = parsed.out.suffix.removeprefix(".")
     write_atomically(parsed.out, lambda file: figure.savefig(file, dpi=150), suffix=form)
-    print(f"{len(rows):,} evaluations of {len(panels)} target(s); written: {parsed.out}")
+    say(f"{len(rows):,} evaluations of {len(panels)} target(s); written: {parsed.out}")
     return 0
 
 
@@ -138,6 +140,7 @@ def _result(file: Path) -> list[dict[str, Any]] | None:
             shifted = env_id(content["job"]["task"], content["target"]["shift"])  # as of ``transfer``
             of_run = {"method": content["job"]["label"], "target": shifted, "seed": content["job"]["seed"]}
             known = {name: content["job"].get(name) for name in ("settings", "episodes")}
+            known["source"] = env_id(content["job"]["task"])
             agent = content.get("source", {}).get("sha256")
         else:
             of_run = {name: content["config"][name] for name in ("method", "target", "seed")}

@@ -125,9 +125,14 @@ class RunFolder:
         """
         folder = self.checkpoints
         unfinished = folder / f".{steps:010d}.{os.getpid()}"
-        shutil.rmtree(unfinished, ignore_errors=True)  # of a killed run: in a container all have the same number
+        for left in folder.glob(".*"):  # of killed runs, which may have filled the disk
+            shutil.rmtree(left)
         unfinished.mkdir(parents=True)
-        write(unfinished)
+        try:
+            write(unfinished)
+        except OSError as error:  # a full disk: not fuller by half a checkpoint
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise OSError(f"{folder}: the checkpoint of step {steps:,} cannot be written: {error}") from error
         unfinished.rename(folder / f"{steps:010d}")
         for old in folder.iterdir():
             if old.name != f"{steps:010d}":

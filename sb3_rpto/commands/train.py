@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from functools import partial
 from typing import Any
 
 from sb3_rpto.commands import options
+from sb3_rpto.commands.terminal import say
 
 DESCRIPTION = """\
 Train a SAC in a task: the source agent of later transfers.
@@ -75,10 +75,10 @@ def run(parsed: argparse.Namespace) -> int:
     }
     folder = RunFolder.open(parsed.out, config)
     if folder.result.exists():
-        print(f"trained already: {folder.model}")
+        say(f"trained already: {folder.model}")
         return 0
-    say = None if parsed.quiet else partial(print, flush=True)
-    curve = SavedCurve(folder, task.make, every, steps, parsed.episodes, parsed.seed, until=parsed.until, say=say)
+    told = None if parsed.quiet else say
+    curve = SavedCurve(folder, task.make, every, steps, parsed.episodes, parsed.seed, until=parsed.until, say=told)
     checkpoint = folder.newest_checkpoint()
     model: Any
     if checkpoint is None:
@@ -93,5 +93,5 @@ def run(parsed: argparse.Namespace) -> int:
     rows = [{"method": "sac", "seed": parsed.seed, **row} for row in curve.rows]
     folder.finish(rows)
     last = rows[-1]
-    print(f"return {last['return']:.1f} after {last['steps']:,} steps; written: {folder.model}")
+    say(f"return {last['return']:.1f} after {last['steps']:,} steps; written: {folder.model}")
     return 0

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_rpto.commands import options, recordings
+from sb3_rpto.commands.terminal import say
 
 if TYPE_CHECKING:
     from sb3_rpto.commands.runs import SavedCurve
@@ -112,7 +112,7 @@ def run(parsed: argparse.Namespace) -> int:
     }
     folder = RunFolder.open(parsed.out, config)
     if folder.result.exists():
-        print(f"transferred already: {folder.model}")
+        say(f"transferred already: {folder.model}")
         return 0
     method = REGISTRY[parsed.method]
     given = Run(
@@ -134,7 +134,7 @@ def run(parsed: argparse.Namespace) -> int:
         parsed.seed,
         after_update=method.in_batches,
         resumable=parsed.method not in NOT_RESUMABLE,
-        say=None if parsed.quiet else partial(print, flush=True),
+        say=None if parsed.quiet else say,
     )
     checkpoint = folder.newest_checkpoint()
     if checkpoint is None:
@@ -146,8 +146,8 @@ def run(parsed: argparse.Namespace) -> int:
     rows = [{"method": parsed.method, "seed": parsed.seed, **row} for row in curve.rows]
     folder.finish(rows)
     first, last = rows[0], rows[-1]
-    print(f"return {first['return']:.1f} before, {last['return']:.1f} after {last['steps']:,} target steps; ", end="")
-    print(f"written: {folder.model}")
+    told = f"return {first['return']:.1f} before, {last['return']:.1f} after {last['steps']:,} target steps"
+    say(f"{told}; written: {folder.model}")
     return 0
 
 

@@ -329,14 +329,20 @@ class PhysicalDynamics(Dynamics):
     def undone(self, data: Transitions) -> float:
         """Share of the typical one-step error that the next one undoes: about 0.5 where observations are noisy.
 
+        What the commands of a step and of the one before tell of an error is left out: a motor's, or of inertia.
+
         :param data: transitions, oldest first
-        :return: of the position or velocity where it is largest; 0 where fewer than 80 follow on others
+        :return: of the position or velocity where it is largest; 0 where few follow on others
         """
         steps = self._steps(data)
         after = np.flatnonzero(steps.before >= 0)
-        if len(after) < 80:
-            return 0.0
         off = (steps.reach(self.simulation, self.values[None])[0] - steps.reached)[:, steps.compared]
+        sent = data.actions.cpu().numpy()[steps.rows]
+        told = np.concatenate([sent, np.where(steps.before[:, None] >= 0, sent[steps.before], 0.0)], axis=1)
+        told = np.concatenate([told, np.ones((len(told), 1))], axis=1)
+        if len(after) < max(80, 4 * told.shape[1]):
+            return 0.0
+        off = off - told @ np.linalg.lstsq(told, off, rcond=None)[0]
         now, past = off[after], off[steps.before[after]]
         return float(-np.min((now * past).mean(axis=0) / np.maximum((off**2).mean(axis=0), 1e-300)))
 

@@ -96,23 +96,27 @@ def drawn_numbers(env: gym.Env) -> list[str]:
 def odd_state(env: gym.Env, recover: StateMap) -> str | None:
     """Which coordinate the observations do not show as they are said to; None where all are, but for some noise.
 
-    A copy is stepped by random actions. Nothing is found where it cannot be copied.
+    A copy is stepped by random actions, and each of its states read twice more by another one, which tells the noise.
+    Nothing is found where it cannot be copied.
 
     :param env: a MuJoCo environment; untouched
     :param recover: states from its observations
     :raises ValueError: what the map returns has other shapes than states
     """
-    twin = copy_env(env)
-    if twin is None:
+    twin, other = copy_env(env), copy_env(env)
+    if twin is None or other is None:
         return None
     base: Any = twin.unwrapped
     twin.action_space.seed(0)
-    observations, states = list[np.ndarray](), list[np.ndarray]()
+    other.reset(seed=0)
+    observations, states, again = list[np.ndarray](), list[np.ndarray](), list[list[np.ndarray]]()
     for seed in range(SHOWN):
         observation, _ = twin.reset(seed=seed)
         for _ in range(STEPS):
             observations.append(np.asarray(observation, dtype=float))
             states.append(np.concatenate([base.data.qpos, base.data.qvel]))
+            now = base.data.qpos.copy(), base.data.qvel.copy(), base.data.ctrl.copy()
+            again.append([observe(other, *now) if hasattr(base, "_get_obs") else observations[-1] for _ in range(2)])
             observation, _, ended, _, _ = twin.step(twin.action_space.sample())
             if ended:
                 break
@@ -121,7 +125,10 @@ def odd_state(env: gym.Env, recover: StateMap) -> str | None:
     turns = list(shown.wrapped)
     off[:, turns] = (off[:, turns] + np.pi) % (2 * np.pi) - np.pi
     known = np.concatenate([shown.known_qpos, shown.known_qvel], axis=1)
-    wrong = [column for column in range(true.shape[1]) if _is_off(*(x[known[:, column], column] for x in (off, true)))]
+    one, two = (np.nan_to_num(np.concatenate(recover(x)[:2], axis=1)) for x in np.array(again).swapaxes(0, 1))
+    noise = np.sqrt(((one - two) ** 2).mean(axis=0))
+    columns = range(true.shape[1])
+    wrong = [k for k in columns if _is_off(off[known[:, k], k], true[known[:, k], k], float(noise[k]))]
     if not wrong:
         return None
     column = wrong[0]
@@ -134,11 +141,12 @@ def odd_state(env: gym.Env, recover: StateMap) -> str | None:
     )
 
 
-def _is_off(off: np.ndarray, true: np.ndarray) -> bool:
+def _is_off(off: np.ndarray, true: np.ndarray, again: float) -> bool:
     """Whether a coordinate is read as another one, or by another zero or scale: noise has neither.
 
     :param off: what it is read as too much, (n,)
     :param true: what it is, (n,)
+    :param again: by how much two readings of one state typically differ
     """
     if len(off) == 0:
         return False
@@ -146,7 +154,8 @@ def _is_off(off: np.ndarray, true: np.ndarray) -> bool:
     scale = float(off @ moved) / max(float(moved @ moved), 1e-12)
     noise = 4 * float(np.std(off - off.mean() - scale * moved)) / np.sqrt(len(off))
     by = max(float(abs(off.mean())), abs(scale) * spread)
-    return by > max(LEAST, SYSTEMATIC * spread, noise) or bool(np.sqrt((off**2).mean()) > max(OFF * spread, LEAST))
+    typical = float(np.sqrt((off**2).mean()))
+    return by > max(LEAST, SYSTEMATIC * spread, noise) or typical > max(LEAST, OFF * spread, 2 * again)
 
 
 def beyond_states(env: gym.Env) -> int | None:

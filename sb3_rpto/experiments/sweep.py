@@ -142,7 +142,7 @@ def run(
         ran = {"versions": versions(), "commit": commit(), **machine()} if pending or not known else {}
         write_json(folder / "manifest.json", {**known, **about, **ran})
         say = _Progress([task.job for task in pending], workers)
-        for result in side_by_side(work, pending):
+        for result in side_by_side(work, pending, lost=killed):
             say(result)
     return [json.loads((folder / "runs" / f"{job.name}.json").read_text(encoding="utf-8")) for job in listed]
 
@@ -184,12 +184,19 @@ def _manifest(folder: Path, suite: Suite) -> dict[str, Any]:
     return known
 
 
-def spread(function: Callable[[Item], Answer], items: Iterable[Item], workers: int, backend: str) -> Iterator[Answer]:
+def spread(
+    function: Callable[[Item], Answer],
+    items: Iterable[Item],
+    workers: int,
+    backend: str,
+    lost: Callable[[Item], Answer] | None = None,
+) -> Iterator[Answer]:
     """Answers of a function, in the order in which they come; items are begun in theirs.
 
     :param function: of a module, and items that pickle
     :param workers: side by side; on a Ray cluster as many as it has CPUs
     :param backend: one of :data:`BACKENDS`
+    :param lost: the answer for an item whose process the system ends, for want of memory, say; None: an error
     """
     items = list(items)
     if not items:
@@ -202,12 +209,42 @@ def spread(function: Callable[[Item], Answer], items: Iterable[Item], workers: i
             done, waiting = ray.wait(waiting)
             yield from ray.get(done)
         return
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    left = dict(enumerate(items))
+    while left:
+        try:
+            for i, answer in _side_by_side(function, left, workers):
+                del left[i]
+                yield answer
+        except TerminatedWorkerError:
+            # It takes the others down with it. Items are begun in order: one of the first is to blame, and each is
+            # tried again by itself.
+            for i in list(left)[:workers]:
+                try:
+                    ((_, answer),) = _side_by_side(function, {i: left[i]}, 2)
+                except TerminatedWorkerError:
+                    if lost is None:
+                        raise
+                    answer = lost(left[i])
+                del left[i]
+                yield answer
+
+
+def _side_by_side(
+    function: Callable[[Item], Answer], items: dict[int, Item], workers: int
+) -> Iterator[tuple[int, Answer]]:
+    """The answers with their items' numbers, from other processes."""
     from joblib import Parallel, delayed, parallel_config
 
-    with parallel_config("loky", n_jobs=min(workers, len(items)), inner_max_num_threads=1):
+    with parallel_config("loky", n_jobs=min(workers, max(len(items), 2)), inner_max_num_threads=1):
         yield from Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="n_jobs")(
-            delayed(function)(item) for item in items
+            delayed(_numbered)(function, i, item) for i, item in list(items.items())
         )
+
+
+def _numbered(function: Callable[[Item], Answer], i: int, item: Item) -> tuple[int, Answer]:
+    return i, function(item)
 
 
 @contextmanager
@@ -293,7 +330,7 @@ def work(task: Task) -> Result:
         :func:`~sb3_rpto.experiments.run.transfer`
     """
     th.set_num_threads(1)
-    job, began, made_by = task.job, time.perf_counter(), commit()
+    began, made_by = time.perf_counter(), commit()
     arguments: dict[str, Any] = {}
     rows: list[dict[str, Any]] = []
     error = None
@@ -301,6 +338,19 @@ def work(task: Task) -> Result:
         rows = learning_curve(task, arguments)
     except Exception:
         error = traceback.format_exc(limit=-3)
+    return _write(task, arguments, rows, error, round(time.perf_counter() - began, 2), made_by)
+
+
+def killed(task: Task) -> Result:
+    """The result of a run whose process the system ended."""
+    error = "its process was ended by the system (for want of memory?)"
+    return _write(task, {}, [], error, 0.0, commit())
+
+
+def _write(
+    task: Task, arguments: dict[str, Any], rows: list[dict[str, Any]], error: str | None, seconds: float, made_by: Any
+) -> Result:
+    job = task.job
     result = {
         "name": job.name,
         "job": job.to_json(),
@@ -310,7 +360,7 @@ def work(task: Task) -> Result:
         "versions": versions(),
         "commit": made_by,
         **machine(),
-        "seconds": round(time.perf_counter() - began, 2),
+        "seconds": seconds,
         "error": error,
         "rows": rows,
     }

@@ -126,7 +126,8 @@ def jumps(time: np.ndarray, position: np.ndarray) -> np.ndarray:
     :param position: in rad or m, shape (T,)
     :return: whether each step is one
     """
-    speed = np.abs(np.diff(position)) / np.diff(time)
+    steps = np.diff(time)
+    speed = np.abs(np.diff(position)) / np.maximum(steps, np.median(steps))  # a row may be stamped late
     falling = np.sort(speed)[::-1]
     most = max(1, int(RARE * len(speed)))
     larger, smaller = falling[:most], falling[1 : most + 1]

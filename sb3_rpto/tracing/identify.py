@@ -30,6 +30,8 @@ KEPT = 0.5
 CRUDE = 0.01
 #: All windows' errors below so many units of the noise, for exact data 1e-7 of what a position varies by, are met.
 MET = 1e-3
+#: Steps of the starts by themselves after which a verdict may rest on them; none where all fall by less than a share.
+SETTLED, STILL = 10, 1e-3
 #: Most simulations in one batch.
 CHUNK = 6000
 
@@ -380,9 +382,12 @@ class Problem:
             trial = starts.copy()
             trial[:, self.moving] -= self.reduce(r, jt, jx, starts, loss).move
             now = self.residuals(rows, trial, np.arange(count))
-            better = loss.energy(now, trial) < loss.energy(r, starts)
+            before, after = loss.energy(r, starts), loss.energy(now, trial)
+            better = after < before
             starts = np.where(better[:, None], trial, starts)
             best = np.where(better[:, None], now, r)
+            if np.minimum(before, after).sum() > (1 - STILL) * before.sum():
+                break
         best = self.residuals(rows, starts, np.arange(count)) if best is None else best
         return Fit(values, starts, self.errors(best), float(Loss.of(best).energy(best, starts).sum()))
 
@@ -403,7 +408,8 @@ class Problem:
         """
         if self.windows.noisy_starts:
             generators = np.random.default_rng(seed).spawn(draws)
-            return np.array([self.redrawn(fit, rng).score(fit.values).errors for rng in generators])
+            drawn = (self.redrawn(fit, rng).score(fit.values, iterations=SETTLED) for rng in generators)
+            return np.array([each.errors for each in drawn])
         _, _, jx = self.linearise(fit.values, fit.starts, np.empty(0, dtype=int))
         w = self.windows
         rng = np.random.default_rng(seed)

@@ -107,7 +107,8 @@ def misread(found: Found, set_up: SetUp) -> list[Finding]:
 
     # The declared numbers alone may promise more: what was found makes up for the way of reading.
     begins = (model.fit.values, found.base.fit.values)
-    usual = float(np.median(problem(lambda episode: episode, range(len(set_up.sigma))).score(begins[0]).errors))
+    as_read = problem(lambda episode: episode, range(len(set_up.sigma)))
+    usual = float(np.median(as_read.fit(begins[0], free, iterations=ITERATIONS).errors))
     tried = []
     for reading in readings(set_up.nominal, data):
         there = problem(reading.again, reading.order)

@@ -11,7 +11,7 @@ from sb3_rpto.tracing.adequacy import Adequacy, adequacy, counted_with
 from sb3_rpto.tracing.calibrate import calibrated
 from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evidence import GAIN
-from sb3_rpto.tracing.identify import Fit, Problem
+from sb3_rpto.tracing.identify import SETTLED, Fit, Problem
 from sb3_rpto.tracing.kinds import few_kinds
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.screen import Screening, screen
@@ -139,10 +139,14 @@ def closely(
         return on, model, seen
     on.say(0.0, "judging with shorter steps in time")
     then = finer(on.fine.horizon)
-    if then is None or not judged(then.fine, model, seed).ratio < (1 - FINER) * seen.ratio:
+    if then is None:
+        return on, model, seen
+    # Values that make up for the longer steps would err with the shorter ones.
+    look = then.fine.model(model.effects, model.fit, iterations=4)
+    if not judged(then.fine, look, seed).ratio < (1 - FINER) * seen.ratio:
         return on, model, seen
     then.fine.threshold = then.rough.threshold = on.fine.threshold
-    model = then.fine.model(model.effects, model.fit, iterations=10)
+    model = then.fine.model(model.effects, look.fit, iterations=10)
     return then, model, judged(then.fine, model, seed)
 
 
@@ -302,8 +306,8 @@ def settle(on: Selectors, selection: Selection, screening: Screening) -> Selecti
 
 def judged(selector: Selector, model: Model, seed: int) -> Adequacy:
     """How a model's errors compare with those of the noise alone, on the windows to judge."""
-    seen = adequacy(selector.judging, selector.judging.score(model.fit.values), seed)
+    seen = adequacy(selector.judging, selector.judging.score(model.fit.values, iterations=SETTLED), seed)
     if selector.select is None or len(selector.select.windows) >= FEW:
         return seen
-    fitted = adequacy(selector.train, selector.train.score(model.fit.values), seed)
+    fitted = adequacy(selector.train, selector.train.score(model.fit.values, iterations=SETTLED), seed)
     return counted_with(seen, len(selector.select.windows), fitted, len(selector.train.windows))

@@ -29,7 +29,8 @@ def undeclared_mass(found: Found, set_up: SetUp) -> list[Finding]:
     simulation, selection = train.simulation, found.selection
     windows = cut(simulation.model, data, set_up.sigma, found.on.fine.horizon, WINDOWS)
     begins = (selection.model.fit.values, found.base.fit.values)  # what was found may make up for the mass
-    usual = float(np.median(Problem(simulation, windows, train.scales).score(begins[0]).errors))
+    as_is = Problem(simulation, windows, train.scales)
+    usual = as_is.fit(begins[0], found.on.fine.free(selection.model.effects), iterations=ITERATIONS)
     declared = [effect.label for effect in simulation.effects if isinstance(effect, Declared)]
     tried = []
     for mass in candidates(set_up.nominal, declared, {"mass_scale"}):
@@ -41,7 +42,7 @@ def undeclared_mass(found: Found, set_up: SetUp) -> list[Finding]:
     best, share = None, CLEARLY
     for _, values, there, body in sorted(tried, key=lambda one: one[0])[:FITTED]:
         fit = there.fit(values, free, iterations=ITERATIONS)
-        if (now := float(np.median(fit.errors)) / usual) < share:
+        if (now := float(np.median(fit.errors) / np.median(usual.errors))) < share:
             best, share = (body, 1 + fit.values[-1]), now
     if best is None:
         return []

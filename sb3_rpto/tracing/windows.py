@@ -21,6 +21,8 @@ from sb3_rpto.tracing.starts import HALF_COUNT, HALF_WIDTH, TRUST, half_step, lo
 
 #: Seconds of commands kept from before a window, for effects that delay and filter: four constants of the slowest lag.
 MEMORY = 1.0
+#: Turns of older commands that come before those, a step each, for what does not forget with time: a play.
+REVERSALS = 16
 #: After a gap the longest delay of the library is waited for, at most for this share of what is there.
 WAITED = 0.25
 #: Exact data (from a simulator) count as noisy by this share of a position's standard deviation.
@@ -281,6 +283,10 @@ def _build(
         )
         if data.idle and not e.after_gap:
             commands[w][grid < e.time[0] - 0.5 * h] = 0
+        older = e.ctrl[: np.searchsorted(e.time, grid[0])]
+        for column, values in zip(actuators, older.T if len(older) else ()):
+            turns = reversals(values, min(REVERSALS, before // 4))
+            commands[w][: len(turns), column] = turns
         enabled[w][:, actuators] = e.enabled[row[before:]]
         n = end - begin - 1
         at[w, :n] = np.minimum((e.time[begin + 1 : end] - t0) / h, steps)
@@ -315,6 +321,25 @@ def _build(
         data.touching,
         data.noise is not None,
     )
+
+
+def reversals(values: np.ndarray, most: int) -> np.ndarray:
+    """What a play remembers of commands, however long ago: the first, and extrema of which none is beyond an earlier.
+
+    :param values: commands in their order, (n,), n > 0
+    :param most: of the first, largest ones, so many are kept
+    :return: at most ``most`` commands that leave a play of any width where all of them do, up to the last command
+    """
+    last = len(values) - 1
+    at, other = sorted(last - int(np.argmax(x[::-1])) for x in (values, -values))
+    found = [0, at, other]
+    at, sign = other, 1.0 if values[other] > values[at] else -1.0
+    while at < last and len(found) < most:
+        rest = sign * values[at:]
+        at += len(rest) - 1 - int(np.argmin(rest[::-1]))
+        sign = -sign
+        found.append(at)
+    return np.asarray(values[found[:most]])
 
 
 def join(a: Windows, b: Windows) -> Windows:

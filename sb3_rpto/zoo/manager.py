@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 import sys
 import warnings
@@ -227,9 +228,11 @@ class TransferManager(ExperimentManager):
             if self.algo == "sac":
                 hyperparams["learning_starts"] = 0  # a trained agent takes no random steps
             agent: Any = super()._load_pretrained_agent(hyperparams, env)
-            came_from = settings_beside(self.trained_agent, "args.yml").get("env")
-            if came_from is not None and EnvironmentName(str(came_from)) != self.env_name:
-                print(f"Trained in {came_from}: it begins here with an empty replay buffer")
+            came_from = settings_beside(self.trained_agent, "args.yml").get("env") or _target_beside(self.trained_agent)
+            here = came_from is not None and EnvironmentName(str(came_from)) == self.env_name
+            if not here and (came_from is not None or agent.replay_buffer.size()):
+                place = came_from or "an environment that nothing beside it tells"
+                print(f"Trained in {place}: it begins here with an empty replay buffer")
                 agent.replay_buffer.reset()
             return agent
         if not self.resumes:
@@ -406,6 +409,14 @@ def settings_beside(trained_agent: str, name: str) -> dict[str, Any]:
     """
     found = sorted(Path(trained_agent).parent.glob(f"*/{name}"))
     return dict(yaml.unsafe_load(found[0].read_text())) if len(found) == 1 else {}  # it holds an OrderedDict's tag
+
+
+def _target_beside(trained_agent: str) -> str | None:
+    """In what ``sb3-rpto train`` or ``transfer`` trained a zip; None where it is not in such a run's folder."""
+    try:
+        return str(json.loads(Path(trained_agent).with_name("config.json").read_text(encoding="utf-8"))["target"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _close(model: TransferAlgorithm) -> None:

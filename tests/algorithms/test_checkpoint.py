@@ -10,7 +10,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import OURS, SMALL_ENSEMBLE, SMALL_POLICY, pendulum, small
+from conftest import OURS, PHI_0_STEPS, SMALL_ENSEMBLE, SMALL_POLICY, pendulum, small
+from gymnasium.envs.classic_control import PendulumEnv
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -220,6 +221,39 @@ def test_a_world_that_is_built_otherwise_begins_a_new_episode(tmp_path):
     with pytest.warns(UserWarning, match="target environment cannot be restored"):
         model.learn(10, reset_num_timesteps=False)
     assert model.num_timesteps == 40
+
+
+def test_a_model_that_is_saved_before_it_learns_resumes_all_the_same(tmp_path):
+    SAC("MlpPolicy", pendulum(), seed=3, policy_kwargs=SMALL_POLICY, buffer_size=10).save(tmp_path / "sac")
+    model = RPO.from_source(tmp_path / "sac", pendulum(), pendulum(12.0), seed=0, device="cpu", batch_size=32)
+    model.save(tmp_path / "m")
+    model.save_replay_buffer(tmp_path / "m.pkl")
+    model.learn(20)
+    th.rand(7)  # whatever happens between
+    again = RPO.load(tmp_path / "m", pendulum(), target_env=pendulum(12.0), device="cpu")
+    again.load_replay_buffer(tmp_path / "m.pkl")
+    np.random.seed(5)
+    again.learn(20, reset_num_timesteps=False)
+    assert_same(model, again)
+
+
+def test_source_steps_count_as_they_are_taken(monkeypatch):
+    model, step = small(RPO), PendulumEnv.step
+    taken = []
+
+    def interrupted(self, action):
+        taken.append(action)
+        if len(taken) == 30:
+            raise KeyboardInterrupt
+        return step(self, action)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PendulumEnv, "step", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(20, source_timesteps=0)
+    assert model.source_timesteps == model.replay_buffer.source.size() == 29
+    model.learn(20, source_timesteps=0, reset_num_timesteps=False)
+    assert model.source_timesteps == PHI_0_STEPS + 20 * 8
 
 
 @pytest.mark.parametrize("cls", OURS)

@@ -165,6 +165,20 @@ def test_frozen_layers_stay_and_the_rest_learns(network, begun):
     assert not any(map(th.equal, rest, weights(*layers[1:])))
 
 
+def test_layers_that_are_frozen_in_turns_learn_in_turns():
+    model = small(RPO, policy_kwargs={"net_arch": [16, 16]})
+    trunk, heads = model.actor.latent_pi, (model.actor.mu, model.actor.log_std)
+    trunk.requires_grad_(False)
+    model.learn(24, source_timesteps=0)
+    for still, moving in ((heads, [trunk]), ([trunk], heads)):
+        for module in (*still, *moving):
+            module.requires_grad_(module in moving)
+        stays, moves = weights(*still), weights(*moving)
+        model.learn(24, source_timesteps=0, reset_num_timesteps=False)
+        assert all(map(th.equal, stays, weights(*still)))
+        assert not any(map(th.equal, moves, weights(*moving)))
+
+
 class FrozenExtractor(FlattenExtractor):
     """Features of a network that was trained elsewhere."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -250,6 +251,15 @@ def test_a_checkpoint_is_replaced_as_a_whole(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run.save_checkpoint(2, killed)
     assert (run.newest_checkpoint() / "model.zip").read_text() == "first"
+
+    def full(folder: Path) -> None:
+        assert not list(folder.parent.glob(".0000000002.*"))  # what was left takes no room
+        (folder / "model.zip").write_text("half")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match=r"checkpoints: the checkpoint of step 3 cannot be written: .*No space left"):
+        run.save_checkpoint(3, full)
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["0000000001"]
     run.save_checkpoint(3, lambda folder: (folder / "model.zip").write_text("third") and None)
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["0000000003"]
     with pytest.raises(ValueError, match="a=1, not 2"):
@@ -612,6 +622,26 @@ def test_a_finished_run_without_its_model_says_how_it_comes_back(
     (tmp_path / "run" / "model.zip").unlink()
     assert cli.main(["enjoy", str(tmp_path / "run")]) == 2
     assert "its run is finished and model.zip is gone; remove result.json" in error(capsys)
+
+
+def test_a_terminal_need_not_show_a_folders_name(agent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(agent, tmp_path / "源")
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
+    assert train(tmp_path / "源", "--device", "cpu") == 0  # trained already
+    sys.stdout.seek(0)
+    assert sys.stdout.read().endswith("?/model.zip\n")
+
+
+def test_curves_of_a_transfer_and_of_a_benchmark_are_of_one_method(tmp_path: Path) -> None:
+    rows = [{"steps": 0, "return": 1.0}]
+    settings = {"gradient_steps": 1}
+    config = {"method": "rpto", "target": TARGET, "source": SOURCE, "seed": 0, "settings": settings, "episodes": 5}
+    config["source_model_sha256"] = "a" * 64
+    job = {"task": "ContinuousCartPole", "label": "rpto", "seed": 1, "settings": settings, "episodes": 5}
+    benchmark = {"job": job, "source": {"sha256": "a" * 64}, "target": {"shift": "limb-x2"}, "rows": rows}
+    (tmp_path / "a.json").write_text(json.dumps({"config": config, "rows": rows}))
+    (tmp_path / "b.json").write_text(json.dumps(benchmark))
+    assert [(row["method"], row["seed"]) for row in read_rows([tmp_path])] == [("rpto", 0), ("rpto", 1)]
 
 
 def test_curves_of_a_benchmark_are_told_apart_by_settings_and_agents(tmp_path: Path) -> None:

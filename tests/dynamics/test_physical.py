@@ -683,8 +683,21 @@ def test_observations_that_are_noisier_than_resets_are_no_goal(noise):
         def _get_obs(self):
             return super()._get_obs() + self.np_random.normal(0, noise, 11)
 
-    env = Noisy()
-    check_memoryless(env, state_map(gym.make(HOPPER)))
+    plain = state_map(gym.make(HOPPER))
+    register_state_map(Noisy, lambda env: plain)
+    physical_config(Noisy())
+    check_memoryless(Noisy(), plain)
+
+
+def test_a_map_in_another_order_is_refused_however_noisy():
+    class Shaken(HopperEnv):
+        def _get_obs(self):
+            return super()._get_obs() + self.np_random.normal(0, 0.01, 11)
+
+    plain = state_map(gym.make(HOPPER))
+    register_state_map(Shaken, lambda env: lambda obs: plain(obs[:, [0, 1, 3, 2, 4, 5, 6, 7, 9, 8, 10]]))
+    with pytest.raises(ValueError, match="where the observation is read as"):
+        physical_config(Shaken())
 
 
 @pytest.mark.parametrize(
@@ -706,6 +719,15 @@ def test_observations_that_err_are_told_from_what_a_simulator_lacks(change, nois
         warnings.simplefilter("default" if noisy_sensors else "error")
         doubt(model, min(model.error(data), 0.4), data)
     assert model.undone(data.take(slice(60))) == 0
+
+
+def test_inertia_that_is_not_declared_is_no_noise_under_alternating_commands():
+    target = gym.make("HalfCheetah-v5")
+    target.unwrapped.model.dof_armature[3:] *= 2
+    data = collect(target, 250, scale=1.0)
+    model = dynamics("HalfCheetah-v5", [])
+    assert model.error(data) > 0.2
+    assert model.undone(data) < 0.25
 
 
 def test_an_effect_is_there_once_and_described():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -56,6 +57,30 @@ def worked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr(sweep, "learning_curve", counted)
     return names
+
+
+def die_at_one(item: int) -> int:
+    if item == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return -item
+
+
+@pytest.mark.slow
+def test_a_process_that_the_system_ends_takes_no_other_run_with_it() -> None:
+    answers = list(sweep.spread(die_at_one, range(5), 2, "joblib", lost=lambda item: 100 + item))
+    assert sorted(answers) == [-4, -3, -2, 0, 101]
+    with pytest.raises(RuntimeError, match="terminated"):
+        list(sweep.spread(die_at_one, range(3), 2, "joblib"))
+
+
+def test_a_run_whose_process_was_ended_is_one_that_failed(tmp_path: Path) -> None:
+    job = jobs(SUITE)[0]
+    (tmp_path / "agent.zip").write_text("")
+    task = sweep.Task(job, str(tmp_path / "agent.zip"), None, str(tmp_path))
+    result = sweep.killed(task)
+    assert "ended by the system" in result["error"]
+    assert json.loads((tmp_path / f"{job.name}.json").read_text()) == result
+    assert sweep.stored(task) is None  # so it is made again
 
 
 # --- resuming -------------------------------------------------------------------------------------------------------

@@ -392,6 +392,12 @@ def test_motion_is_no_jump(position):
     assert not checks.jumps(TIME, position).any()
 
 
+def test_rows_that_are_stamped_late_are_no_jump():
+    time = TIME.copy()
+    time[[200, 600, 1100]] += 0.0095
+    assert not checks.jumps(time, np.sin(2 * time)).any()
+
+
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=50, deadline=None)
 def test_unwrap_restores_any_smooth_angle(seed):

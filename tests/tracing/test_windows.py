@@ -5,14 +5,17 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from simulated import PENDULUM, compiled, recorded
 
-from sb3_rpto.effects import Simulation
+from sb3_rpto.effects import Drive, Simulation
+from sb3_rpto.effects.commands import Backlash
 from sb3_rpto.effects.names import object_id
 from sb3_rpto.tracing import Measurements
 from sb3_rpto.tracing.interpolation import interpolate
 from sb3_rpto.tracing.prepare import at_rest
-from sb3_rpto.tracing.windows import ENOUGH_BLOCKS, EXACT, cut, discretised, noise_levels
+from sb3_rpto.tracing.windows import ENOUGH_BLOCKS, EXACT, REVERSALS, cut, discretised, noise_levels, reversals
 
 SIGMA = np.array([1e-3])
 
@@ -224,7 +227,42 @@ def test_commands_are_the_mean_of_those_held_over_each_step_from_before_the_star
         begin = t0 + h * np.arange(-windows.drive.before, round(0.3 / h)) - (0.0 if integrator == "RK4" else h / 2)
         within = begin[:, None] + h * parts
         row = np.clip(np.searchsorted(t, within, side="right") - 1, 0, len(t) - 1)
-        np.testing.assert_allclose(windows.drive.commands[w, :, 0], t[row].mean(1), atol=2e-6)
+        kept = slice(REVERSALS, None)  # before them come turns of older ones
+        np.testing.assert_allclose(windows.drive.commands[w, kept, 0], t[row].mean(1)[kept], atol=2e-6)
+
+
+def play(commands: np.ndarray, half_width: float) -> float:
+    y = float(commands[0])
+    for u in commands:
+        y = min(max(y, u - half_width), u + half_width)
+    return y
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 80), st.floats(0, 3), st.booleans())
+def test_the_turns_of_commands_leave_a_play_where_all_of_them_do(
+    seed: int, n: int, half_width: float, rounded: bool
+) -> None:
+    commands = np.random.default_rng(seed).normal(size=n).cumsum()
+    commands = np.round(commands) if rounded else commands
+    turns = reversals(commands, n + 3)
+    assert play(np.append(turns, commands[-1]), half_width) == pytest.approx(play(commands, half_width))
+    np.testing.assert_array_equal(reversals(commands, 4), turns[:4])
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_windows_after_a_rest_know_where_a_play_was_left(exact: bool) -> None:
+    servo = compiled(PENDULUM.replace('<motor name="motor"', '<position kp="20" kv="1" name="motor"'))
+    truth = Simulation(servo, [Backlash("motor", half_width=0.05)], 1)
+    t = np.arange(1600) / 200
+    goals = np.interp(t % 4.0, [0, 0.3, 2.0, 2.3, 4.0], [0, 0.4, 0.4, 0, 0])[None, :, None]  # and rests of 1.7 s
+    q, v = truth.rollout(truth.values()[None], np.zeros((1, 1)), np.zeros((1, 1)), Drive(goals))
+    table = {"time": t, "qpos.hinge": q[0, :-1, 0], "qvel.hinge": v[0, :-1, 0], "ctrl.motor": goals[0, :, 0]}
+    data = replace(Measurements.from_tables({"run": table}), exact=exact, simulated=True)
+    windows = cut(servo, data, SIGMA, 0.4, 100)
+    assert windows.drive.before == 200
+    reached, _ = truth.rollout(np.tile(truth.values(), (len(windows), 1)), windows.qpos, windows.qvel, windows.drive)
+    off = [abs(reached[w, 80, 0] - windows.measured[w, 79, 0]) for w in range(len(windows))]
+    assert max(off) < 2e-3
 
 
 def test_commands_of_exact_data_are_those_of_the_samples() -> None:
@@ -250,8 +288,9 @@ def test_a_rounded_clock_does_not_give_steps_the_commands_of_their_neighbours(ro
     windows = cut(model, data, SIGMA, 0.4, 100)
     begun = np.searchsorted(data.episodes[0].time, windows.time - 1e-9)
     steps = np.arange(-windows.drive.before, windows.drive.commands.shape[1] - windows.drive.before)
-    row = begun[:, None] + steps
-    np.testing.assert_array_equal(windows.drive.commands[..., 0], np.where(row < 0, 0, np.clip(row, 0, 1499)))
+    row = (begun[:, None] + steps)[:, REVERSALS:]  # before them come turns of older ones
+    expected = np.where(row < 0, 0, np.clip(row, 0, 1499))
+    np.testing.assert_array_equal(windows.drive.commands[:, REVERSALS:, 0], expected)
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.7])
