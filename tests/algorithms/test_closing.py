@@ -345,8 +345,9 @@ def test_a_late_sensor_is_taken_into_phi_by_the_reports_word() -> None:
     late = LIBRARY["sensor_delay"]("hinge", delay=0.09)
     made = filled([late])
     data = made.transitions("target")
-    traced = SimpleNamespace(effect=late, label=late.label, deviation=np.array([0.005]))
-    report = SimpleNamespace(declared=(), effects=(traced,), verdict="explained")
+    traced = SimpleNamespace(effect=late, label=late.label)
+    covariance = np.array([[0.005**2]])
+    report = SimpleNamespace(declared=(), effects=(traced,), covariance=covariance, verdict="explained")
     assert made.loop is not None
     assert made.loop._take(made, dynamics(made), report, data, before=1e-3) == [late.label]  # type: ignore[arg-type]
     assert dynamics(made).error(data) > 1e-3
@@ -642,11 +643,11 @@ def test_effects_have_to_pay_and_declared_numbers_to_be_no_worse(
     monkeypatch.setattr(dynamics(made), "error", lambda _: after)
 
     def taken(*effects: Effect) -> list[str]:
-        traced = [SimpleNamespace(effect=e, label=e.label, deviation=0 * e.values) for e in effects]
+        traced = [SimpleNamespace(effect=e, label=e.label) for e in effects]
         fine = SimpleNamespace(ratio=1.0)
         report = SimpleNamespace(
             **{"declared": traced[:1], "effects": traced[1:], "verdict": "explained"},
-            **{"adequacy_before": fine, "adequacy_after": fine},
+            **{"adequacy_before": fine, "adequacy_after": fine, "covariance": None},
         )
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=r"the trace found coulomb_friction")
@@ -691,10 +692,10 @@ def test_a_new_target_is_traced_anew(soon: None) -> None:
 
 def explanation(effects: list[Effect], verdict: str = "explained", zeros: Zeros | None = None) -> SimpleNamespace:
     """What a trace would report."""
-    traced = tuple(SimpleNamespace(effect=e, label=e.label, deviation=0 * e.values) for e in effects)
+    traced = tuple(SimpleNamespace(effect=e, label=e.label) for e in effects)
     ratio = SimpleNamespace(ratio=1.0)
     said = {"verdict": verdict, "declared": (), "effects": traced, "zeros": zeros, "findings": []}
-    return SimpleNamespace(adequacy_before=ratio, adequacy_after=ratio, **said)
+    return SimpleNamespace(adequacy_before=ratio, adequacy_after=ratio, covariance=None, **said)
 
 
 def test_a_later_explanation_takes_the_place_of_an_earlier_one() -> None:
@@ -892,8 +893,9 @@ class Scripted(EpisodeSource):
         self.earns = iter(earns)
         self.asked: list[int] = []
 
-    def interact(self, model: object, n_steps: int, random: bool = False) -> int:
+    def interact(self, model: Any, n_steps: int, random: bool = False) -> int:
         self.asked.append(n_steps)
+        model.source_timesteps += n_steps
         self.returns.extend([r] if (r := next(self.earns, None)) is not None else [])
         return n_steps
 
@@ -1313,7 +1315,7 @@ def test_a_target_after_a_log_is_not_traced_where_nobody_asked(soon: None, monke
     with pytest.warns(UserWarning, match="ends before the first fit of the dynamics, after 20"):
         arguments.check_ready(made, 10, None)
     judged: list[float] = []
-    monkeypatch.setattr("sb3_rpto.algorithms.bookkeeping.doubt", lambda _, error: judged.append(error))
+    monkeypatch.setattr("sb3_rpto.algorithms.bookkeeping.doubt", lambda _, error, data: judged.append(error))
     made.learn(45)
     assert len(judged) == 1
     assert made.loop is not None
