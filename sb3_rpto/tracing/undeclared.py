@@ -7,7 +7,7 @@ import numpy as np
 from sb3_rpto.effects import Declared, Scales, Simulation
 from sb3_rpto.effects.library import candidates
 from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.identify import Problem
+from sb3_rpto.tracing.identify import SETTLED, Problem
 from sb3_rpto.tracing.misread import CLEARLY, FITTED, ITERATIONS, WINDOWS
 from sb3_rpto.tracing.prepare import SetUp
 from sb3_rpto.tracing.search import Found
@@ -29,8 +29,7 @@ def undeclared_mass(found: Found, set_up: SetUp) -> list[Finding]:
     simulation, selection = train.simulation, found.selection
     windows = cut(simulation.model, data, set_up.sigma, found.on.fine.horizon, WINDOWS)
     begins = (selection.model.fit.values, found.base.fit.values)  # what was found may make up for the mass
-    as_is = Problem(simulation, windows, train.scales)
-    usual = as_is.fit(begins[0], found.on.fine.free(selection.model.effects), iterations=ITERATIONS)
+    usual = Problem(simulation, windows, train.scales).score(begins[0], iterations=SETTLED)
     declared = [effect.label for effect in simulation.effects if isinstance(effect, Declared)]
     tried = []
     for mass in candidates(set_up.nominal, declared, {"mass_scale"}):
