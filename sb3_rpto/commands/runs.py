@@ -125,12 +125,12 @@ class RunFolder:
         """
         folder = self.checkpoints
         unfinished = folder / f".{steps:010d}.{os.getpid()}"
-        for left in folder.glob(".*"):  # of killed runs, which may have filled the disk
+        for left in folder.glob(".[0-9]*"):  # of killed runs, which may have filled the disk
             shutil.rmtree(left)
         unfinished.mkdir(parents=True)
         try:
             write(unfinished)
-        except OSError as error:  # a full disk: not fuller by half a checkpoint
+        except (OSError, RuntimeError) as error:  # a full disk, by torch too: not fuller by half a checkpoint
             shutil.rmtree(unfinished, ignore_errors=True)
             raise OSError(f"{folder}: the checkpoint of step {steps:,} cannot be written: {error}") from error
         unfinished.rename(folder / f"{steps:010d}")

@@ -336,12 +336,12 @@ class PhysicalDynamics(Dynamics):
         """
         steps = self._steps(data)
         after = np.flatnonzero(steps.before >= 0)
-        off = (steps.reach(self.simulation, self.values[None])[0] - steps.reached)[:, steps.compared]
         sent = data.actions.cpu().numpy()[steps.rows]
-        told = np.concatenate([sent, np.where(steps.before[:, None] >= 0, sent[steps.before], 0.0)], axis=1)
-        told = np.concatenate([told, np.ones((len(told), 1))], axis=1)
+        before = np.where(steps.before[:, None] >= 0, sent[steps.before], 0.0)
+        told = np.concatenate([sent, before, np.ones((len(sent), 1))], axis=1)
         if len(after) < max(80, 4 * told.shape[1]):
             return 0.0
+        off = (steps.reach(self.simulation, self.values[None])[0] - steps.reached)[:, steps.compared]
         off = off - told @ np.linalg.lstsq(told, off, rcond=None)[0]
         now, past = off[after], off[steps.before[after]]
         return float(-np.min((now * past).mean(axis=0) / np.maximum((off**2).mean(axis=0), 1e-300)))
