@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import json
 import math
 import os
+import time
 from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+#: A temporary file that is older than so many seconds is nobody's any more.
+LEFT = 3600.0
 
 
 def write_atomically(path: Any, write: Callable[[Any], None], suffix: str = "zip") -> None:
@@ -71,6 +77,10 @@ def plain(value: Any) -> Any:
 
 def _replace(path: Path, write: Callable[[Path], Any], suffix: str) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{suffix}")
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.{suffix}"):  # of killed runs, which may fill the disk
+        with contextlib.suppress(OSError):
+            if time.time() - left.stat().st_mtime > LEFT:
+                left.unlink()
     try:
         write(temporary)
         with temporary.open("rb+") as file:  # else the name may outlast a crash of the machine, and the contents not

@@ -1,6 +1,7 @@
 """Files are written whole or not at all."""
 
 import json
+import os
 from enum import Enum
 from pathlib import Path
 
@@ -28,6 +29,16 @@ def test_a_writer_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path
     with pytest.raises(KeyboardInterrupt):
         write_atomically(tmp_path / "model", fails)
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("model.zip", "old")]
+
+
+def test_what_killed_writes_left_is_swept_by_a_later_one_and_a_write_under_way_is_not(tmp_path: Path) -> None:
+    old, new, other = (tmp_path / f".{name}.{pid}.zip" for name, pid in (("a.zip", 1), ("a.zip", 2), ("b.zip", 1)))
+    for left in (old, new, other):
+        left.write_text("half")
+    for left in (old, other):
+        os.utime(left, (0, 0))
+    write_atomically(tmp_path / "a", lambda path: path.write_text("whole") and None)
+    assert {p.name for p in tmp_path.iterdir()} == {"a.zip", new.name, other.name}
 
 
 def test_json_is_strict_whatever_a_result_holds(tmp_path: Path) -> None:

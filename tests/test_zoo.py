@@ -292,11 +292,17 @@ def test_a_normalised_agent_is_played_as_it_was_trained(zoo, tmp_path, monkeypat
     assert (warm / final(warm).stem / "vecnormalize.pkl").is_file()
 
 
-def test_ctrl_c_in_the_source_phase_saves_also_with_a_progress_bar(zoo, tmp_path, monkeypatch):
+def test_ctrl_c_in_the_source_phase_saves_also_with_a_progress_bar_and_workers_that_it_ended(
+    zoo, tmp_path, monkeypatch
+):
     begin = RPO.begin_in_source
+
+    def gone(world):
+        raise ConnectionResetError
 
     def interrupted(model, *args):
         begin(model, *args)
+        monkeypatch.setattr(type(model.env.unwrapped), "close", gone)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(RPO, "begin_in_source", interrupted)

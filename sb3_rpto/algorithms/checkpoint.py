@@ -76,14 +76,14 @@ class Resumable(TwoWorlds):
     ) -> None:
         """Save all that a resumed run needs, except the replay buffers (``save_replay_buffer``); atomic for paths."""
         loaded = self._resume_state  # a loaded model that has not learned since stands where it was saved first
-        learner = self.snapshots.get("learner")
+        config, learner = self.dynamics_config, self.snapshots.get("learner")
         since = {"warm": self._warm, "learner": learner, "seed": self._new_seed}
-        self._resume_state = {**loaded, **since} if loaded else capture(self)
-        if self.env is not None:
-            self._resume_state["normalised"] = normalises(self.get_vec_normalize_env())
-        self._resume_state["algorithm"] = _algorithm(type(self))
-        config, self.dynamics_config = self.dynamics_config, _picklable(self.dynamics_config)
         try:
+            self._resume_state = {**loaded, **since} if loaded else capture(self)
+            if self.env is not None:
+                self._resume_state["normalised"] = normalises(self.get_vec_normalize_env())
+            self._resume_state["algorithm"] = _algorithm(type(self))
+            self.dynamics_config = _picklable(config)
             write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
         finally:
             self._resume_state, self.dynamics_config = loaded, config

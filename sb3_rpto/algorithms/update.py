@@ -185,6 +185,8 @@ class RelativeUpdate(SAC):
         if self.weighting is None:
             return None
         assert self.dynamics is not None
+        if self.use_sde:  # as in an update: what explored last is no part of a checkpoint
+            self.actor.reset_noise()
         newest = self.dynamics.fits_newest
         older = 0 if newest is None else max(0, len(data) - newest)
         weights = rto_weights(

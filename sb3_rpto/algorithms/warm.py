@@ -247,8 +247,9 @@ def _report(model: Resumable, source: EpisodeSource) -> None:
     given = model._custom_logger or model.tensorboard_log is not None or "SB3_LOGDIR" in os.environ
     if given and model.logger.dir is not None:
         folder = pathlib.Path(model.logger.dir)
-        model.save(folder / "pretrain.zip")
+        # A process killed between the two leaves transitions of steps that the zip has not, not steps without any.
         model.save_replay_buffer(folder / "pretrain_replay_buffer.pkl")
+        model.save(folder / "pretrain.zip")
 
 
 def _carry_temperature(sac: SAC, model: Resumable) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,23 +20,32 @@ FASTER = 1.5
 ROUNDS = 100
 #: A product as in SAC's update: batch, hidden, hidden.
 SHAPE = (256, 256, 256)
+#: The setting that was found, once for each that is inside.
+_FOUND: list[str] = []
+_LOCK = threading.Lock()
 
 
 @contextmanager
 def fast_products(device: th.device | str = "cpu") -> Iterator[None]:
     """Inside, float32 products on the CPU take oneDNN's kernels if a probe finds them accurate and faster here.
 
-    The setting that was found is restored at the end: the user's other code is not touched.
+    The setting that was found is restored at the end: the user's other code is not touched. It is one for all threads,
+    so the last that is inside restores what the first found.
 
     :param device: where the products are made; on others than the CPU nothing is changed
     """
-    before = th.get_float32_matmul_precision()
-    if th.device(device).type == "cpu" and before == "highest" and pays():
-        th.set_float32_matmul_precision("medium")
+    with _LOCK:
+        found = _FOUND[0] if _FOUND else th.get_float32_matmul_precision()
+        if th.device(device).type == "cpu" and found == "highest" and pays():
+            th.set_float32_matmul_precision("medium")
+        _FOUND.append(found)
     try:
         yield
     finally:
-        th.set_float32_matmul_precision(before)
+        with _LOCK:
+            found = _FOUND.pop()
+            if not _FOUND:
+                th.set_float32_matmul_precision(found)
 
 
 @contextmanager

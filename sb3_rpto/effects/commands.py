@@ -202,7 +202,9 @@ class CommandSaturation(Effect):
 
     kind = "command_saturation"
     place = "actuator"
-    parameters = (Parameter("inverse_limit", "1/command", lambda s: 1.2 / s.command, lower=0.0, starts=(0.6,)),)
+    parameters = (
+        Parameter("inverse_limit", "1/command", lambda s: 1.2 / s.command, lower=0.0, starts=(0.6, 1.5, 3.0)),
+    )
     equation = "clip(u, -1/inverse_limit, 1/inverse_limit)"
     excite = "the largest commands"
     order = 3

@@ -219,6 +219,8 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
 
         :raises ValueError: the environment steps or reads its simulation by other ways than do_simulation and _get_obs
         """
+        if not self._covered:
+            self._called.discard("_get_obs")  # that reset() reads by it says nothing of step()
         result = self.env.step(action)
         unused = sorted(self._wanted - self._called)
         if unused:

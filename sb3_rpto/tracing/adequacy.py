@@ -28,6 +28,7 @@ class Adequacy:
     :param high: 97.5 % quantile, likewise
     :param strays: share of windows whose error noise does not explain
     :param chance: of as many of them by noise alone
+    :param spread: whether several episodes have such windows
     """
 
     ratio: float
@@ -35,6 +36,7 @@ class Adequacy:
     high: float
     strays: float
     chance: float
+    spread: bool = False
 
     @property
     def adequate(self) -> bool:
@@ -93,6 +95,7 @@ def adequacy(problem: Problem, fit: Fit, seed: int) -> Adequacy:
         float(high),
         float(stray.mean()),
         float(binom.sf(count - 1, len(stray), RARE)),
+        len(np.unique(problem.windows.episode[stray])) > 1,
     )
 
 

@@ -119,6 +119,33 @@ def unwrap(angle: np.ndarray, change: np.ndarray | None = None) -> tuple[np.ndar
     return angle - TURN * np.concatenate([[0.0], np.cumsum(jumps)]) if count else angle, count, fast
 
 
+def glitches(time: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Samples, one or two in succession, that are no readings of the joint: far off the line between those around.
+
+    What moves would have to come back at once, and is as fast before or after it: a bounce is. Far is eight times the
+    change of speed across the samples and of its 90 % quantile, and twice a fast or typical step.
+
+    :param time: increasing times in s, shape (T,)
+    :param position: in rad or m, shape (T,)
+    :return: whether each sample is one, (T,)
+    """
+    speed, wrong = np.diff(position) / np.diff(time), np.zeros(len(position), dtype=bool)
+    steps, step = np.abs(np.diff(position)), float(np.median(np.diff(time)))
+    if len(time) < SPAN or not steps.any():
+        return wrong
+    far = 2 * max(float(np.quantile(steps, 0.9)), float(np.median(steps[steps > 0])))
+    for rows in (1, 2):
+        change = np.abs(speed[rows + 2 :] - speed[: -rows - 2]) * step / 2
+        first, last = np.arange(1, len(time) - rows - 2), np.arange(rows + 2, len(time) - 1)  # those around
+        share = [(time[first + r] - time[first]) / (time[last] - time[first]) for r in range(1, rows + 1)]
+        off = [position[first + r + 1] - (1 - x) * position[first] - x * position[last] for r, x in enumerate(share)]
+        off += [position[first + 1] - position[first], position[last - 1] - position[last]]  # and far from either
+        least = np.min(np.abs(off), axis=0) * np.all(np.sign(off) == np.sign(off[0]), axis=0)
+        for k in first[(least > JUMP * np.maximum(change, np.quantile(change, 0.9))) & (least > far)]:
+            wrong[k + 1 : k + 1 + rows] = True
+    return wrong
+
+
 def jumps(time: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Steps of a position that are no motion: few, single, and much larger than all others of their time, (T - 1,).
 

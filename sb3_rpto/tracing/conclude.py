@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from sb3_rpto.effects import LIBRARY, Declared, Effect
-from sb3_rpto.tracing.adequacy import SETTLED, TOLERANCE, judge
+from sb3_rpto.tracing import identify
+from sb3_rpto.tracing.adequacy import SETTLED, TOLERANCE, adequacy, judge
 from sb3_rpto.tracing.cautions import DRY, WORSE, creeping
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.measurements import Measurements
@@ -31,6 +32,11 @@ HELD = Finding(
     "fitted runs",
     "forces stay what they are at the beginning of a step of the environment until its end, as where a wrapper writes "
     "them, and no machine's do",
+)
+UNLIKE = Finding(
+    "split",
+    "fitted runs",
+    "the runs set apart to select on do not show what is missing in the others: blocks of all of them take turns",
 )
 #: Recordings, whether they are of a simulator's own steps, and the kinds of effects to look for.
 Prepared = Callable[[Measurements, bool, Sequence[str] | None], SetUp]
@@ -81,7 +87,12 @@ def conclude(
     def read(data: Measurements, simulated: bool) -> tuple[SetUp, Found]:
         def searched(kinds: Sequence[str] | None) -> tuple[SetUp, Found]:
             set_up = prepared(data, simulated, kinds)
-            return set_up, search(set_up)
+            found = search(set_up)
+            if hidden(found, seed):
+                set_up = set_up.with_all_to_fit()
+                set_up.findings.append(UNLIKE)
+                found = search(set_up)
+            return set_up, found
 
         (set_up, found), softer = searched(kinds), _softer(kinds)
         if softer and not _explains(found) and _creeps(found):
@@ -122,6 +133,14 @@ def conclude(
     if verdict == "unexplained" and not found.after.ratio < first.before.ratio:
         found = replace(found, selection=Selection(found.base), after=found.before)  # it is no hint either
     return Searched(set_up, found, first, zeros, verdict)
+
+
+def hidden(found: Found, seed: int) -> bool:
+    """Whether runs set apart to judge on pass what fails on those fitted to: they cannot tell what is missing there."""
+    select, values = found.on.fine.select, found.selection.model.fit.values
+    if select is None or found.after.adequate:
+        return False
+    return adequacy(select, select.score(values, iterations=identify.SETTLED), seed).adequate
 
 
 def _explains(found: Found) -> bool:

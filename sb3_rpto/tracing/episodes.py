@@ -256,7 +256,7 @@ class _Tell:
         if slope < 0:
             kind, cause = "flipped velocity", "its sign is flipped"
         elif any(checks.SLOPE[0] <= slope / factor <= checks.SLOPE[1] for factor in (DEGREES, 1 / DEGREES)):
-            cause = "one of the two is in degrees; give both in rad"
+            cause = "one of the two is in degrees, times are in minutes or speeds in rpm; give s, rad and rad/s"
         self(kind, f"slope against the position's change is {slope:.2f}, not 1: {cause}; kept as it is", column)
 
 
@@ -345,6 +345,7 @@ def _unwrap_angles(episode: Episode, columns: Columns, tell: _Tell) -> None:
         if fast:
             message = "many steps are of about half a turn, so whole turns may be lost: sample faster, or give qvel"
             tell("fast angle", message, f"qpos.{name}")
+        _bridge_glitches(episode, i, tell, f"qpos.{name}")
         leaps = np.abs(np.diff(episode.qpos[:, i])[checks.jumps(episode.time, episode.qpos[:, i])])
         if len(leaps):
             most = f"{leaps.max():.3g}"
@@ -354,6 +355,23 @@ def _unwrap_angles(episode: Episode, columns: Columns, tell: _Tell) -> None:
                 "the encoder at its own period, or split the run where it was moved by hand or set anew"
             )
             tell("jump", message, f"qpos.{name}")
+
+
+def _bridge_glitches(episode: Episode, column: int, tell: _Tell, where: str) -> None:
+    """Interpolate samples of a position that are no readings, so that no velocity is made of them; none is compared."""
+    position = episode.qpos[:, column]
+    wrong = checks.glitches(episode.time, position)
+    if not wrong.any():
+        return
+    first = int(np.argmax(wrong))
+    message = (
+        f"{wrong.sum()} sample(s) far from those before and after, the first {position[first]:.4g} at "
+        f"{episode.time[first]:.4g} s; interpolated, and no prediction begins there or is compared"
+    )
+    tell("glitch", message, where)
+    position[wrong] = np.interp(episode.time[wrong], episode.time[~wrong], position[~wrong])
+    for known in (episode.usable, episode.placed):
+        known[wrong] = False
 
 
 def _complete_velocities(episode: Episode, columns: Columns, tell: _Tell) -> None:

@@ -101,7 +101,7 @@ def _verdict(report: Report) -> str:
     idle = sum(c.status == "not excited" for c in report.candidates)
     said = "<br>".join(escape(sentence) for sentence in (means, *wording.rest(after), caution))
     verdict = f"<b>{escape(report.verdict.capitalize())}.</b> {said}"
-    apart = "that were not fitted" if report.judged_apart else "that were fitted, as too few runs are set apart"
+    apart = "that were not fitted" if report.judged_apart else "that were fitted, as those set apart show too little"
     ratios = [f"<b>{escape(str(a).removeprefix('R = '))}</b>" for a in (before, after)]
     lines = [
         f'<div class="verdict">{verdict}</div>',

@@ -10,9 +10,11 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 from scipy.signal import savgol_filter
 
-from sb3_rpto.effects import Declared
+from sb3_rpto.effects import Declared, Simulation
 from sb3_rpto.effects.actuation import FILTERS
 from sb3_rpto.effects.names import hinges, near, object_names
+from sb3_rpto.effects.simulation import prepare
+from sb3_rpto.effects.world import BatchWorld
 from sb3_rpto.tracing.checks import WINDOW, Finding, smoothed_velocity
 from sb3_rpto.tracing.columns import columns_of, joint_of
 from sb3_rpto.tracing.measurements import Measurements
@@ -330,12 +332,19 @@ def _forces(model: mujoco.MjModel, data: Measurements) -> Iterator[_Force]:
     runs = list(dict.fromkeys(e.run for e in data.episodes if len(e) >= _FEWEST))
     runs = runs[:: -(-len(runs) // _MOST_RUNS) or 1]
     left = dict.fromkeys(runs, _BUDGET // max(1, len(runs)))
+    nominal, simulation = model, Simulation(model, [], 1)
     for episode in data.episodes:
         rows = slice(0, left.get(episode.run, 0))
         n = len(episode.time[rows])
         if n < _FEWEST:
             continue
         left[episode.run] -= n
+        model = nominal
+        if episode.params:  # a motor may turn the other way in a run that says so
+            known = {name: np.array([value]) for name, value in episode.params.items()}
+            world = BatchWorld(nominal, 1, 1)
+            prepare(world, simulation.from_settings(known))
+            model = world.batch.get_model(0)
         time = episode.time[rows]
         step = float(np.median(np.diff(time)))
         window = 5 if data.exact else int(np.clip(SMOOTHING / step, WINDOW, 101)) // 2 * 2 + 1

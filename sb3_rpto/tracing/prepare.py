@@ -92,6 +92,10 @@ class SetUp:
         )
         return Selectors(fine, rough, say)
 
+    def with_all_to_fit(self) -> SetUp:
+        """The same with no run set apart to select on."""
+        return replace(self, train=self.fitted, select=replace(self.select, episodes=[]), findings=[*self.findings])
+
     def finer(self, horizon: float, say: Progress) -> Selectors | None:
         """The same with shorter steps to judge with; None for what comes from a simulator's own steps."""
         if self.fitted.exact or self.fitted.simulated:

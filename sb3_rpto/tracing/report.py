@@ -247,7 +247,7 @@ class Report:
                 "encoder zeros that differ by run, rad or m: spread, and each",
                 *wording.aligned(self.zeros.rows()),
             ]
-        apart = "on select windows" if self.judged_apart else "on fitted windows, as too few runs are set apart"
+        apart = "on select windows" if self.judged_apart else "on fitted windows, as those set apart show too little"
         lines += ["", f"adequacy R: error over that of noise alone, {apart}; 1 where nothing is missing"]
         lines += [f"  before {self.adequacy_before}, after {self.adequacy_after}"]
         tested = "test runs" if self.runs["test"] else "the fitted runs, as there are no test runs"

@@ -305,9 +305,14 @@ def settle(on: Selectors, selection: Selection, screening: Screening) -> Selecti
 
 
 def judged(selector: Selector, model: Model, seed: int) -> Adequacy:
-    """How a model's errors compare with those of the noise alone, on the windows to judge."""
+    """How a model's errors compare with those of the noise alone, on the windows to judge.
+
+    What a robust fit gives up of the windows that it was made to counts, too: the runs to judge on may be few, or move
+    as none of the others did. Where they show enough by themselves, one odd run among those fitted is only told.
+    """
     seen = adequacy(selector.judging, selector.judging.score(model.fit.values, iterations=SETTLED), seed)
-    if selector.select is None or len(selector.select.windows) >= FEW:
+    if selector.select is None:
         return seen
-    fitted = adequacy(selector.train, selector.train.score(model.fit.values, iterations=SETTLED), seed)
-    return counted_with(seen, len(selector.select.windows), fitted, len(selector.train.windows))
+    count, train = len(selector.select.windows), selector.train
+    fitted = adequacy(train, train.score(model.fit.values, iterations=SETTLED), seed)
+    return counted_with(seen, count, fitted, len(train.windows)) if count < FEW or fitted.spread else seen

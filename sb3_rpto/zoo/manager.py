@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import shutil
 import sys
@@ -422,4 +423,5 @@ def _target_beside(trained_agent: str) -> str | None:
 def _close(model: TransferAlgorithm) -> None:
     for world in (model.env, model.target_env):
         if world is not None:
-            world.close()
+            with contextlib.suppress(EOFError, OSError):  # processes that Ctrl-C has ended, too
+                world.close()

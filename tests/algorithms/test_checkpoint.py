@@ -21,7 +21,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms import checkpoint, warm
 from sb3_rpto.algorithms.mbpo import MBPO
 from sb3_rpto.algorithms.pdml import PDML
 from sb3_rpto.algorithms.ptp import PTP
@@ -156,6 +156,31 @@ def test_resuming_equals_not_having_stopped(case, tmp_path):
     resumed.learn(60, reset_num_timesteps=False)
     assert resumed.num_timesteps in (130, 130 - 130 % 2)
     assert_same(unbroken, resumed)
+
+
+def test_a_save_that_is_interrupted_leaves_the_model_as_it_was(tmp_path, monkeypatch):
+    model = small(RPO).learn(20, source_timesteps=0)
+
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoint, "_picklable", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            model.save(tmp_path / "model")
+    model.learn(20, reset_num_timesteps=False)
+    assert model.replay_buffer.target.size() == model.num_timesteps == 40
+
+
+def test_the_weights_of_a_fit_do_not_hang_on_what_explored_last():
+    model, weights = small(RPTO, use_sde=True).learn(30, source_timesteps=0), []
+    for explored in (1, 2):
+        th.manual_seed(explored)
+        model.actor.reset_noise(3)
+        th.manual_seed(0)
+        weights.append(model.fit_weights(model.transitions("target")))
+    assert th.equal(*weights)
+    assert float(weights[0].std()) > 0
 
 
 @pytest.mark.parametrize("with_buffers", [True, False])

@@ -29,6 +29,17 @@ def test_the_setting_comes_back_after_an_error(monkeypatch):
     assert th.get_float32_matmul_precision() == "highest"
 
 
+def test_threads_that_come_and_go_restore_what_the_first_found(monkeypatch):
+    monkeypatch.setattr(products, "pays", lambda: True)
+    first, second = fast_products(), fast_products()
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert th.get_float32_matmul_precision() == "medium"
+    second.__exit__(None, None, None)
+    assert th.get_float32_matmul_precision() == "highest"
+
+
 def test_what_the_user_chose_stays(monkeypatch):
     monkeypatch.setattr(products, "pays", lambda: True)
     th.set_float32_matmul_precision("high")

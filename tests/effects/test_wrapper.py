@@ -588,6 +588,18 @@ def test_an_environment_that_goes_round_the_seam_is_found_out():
         wrapped.step(np.zeros(1))
 
 
+def test_an_environment_that_reads_its_state_by_itself_in_steps_alone_is_found_out():
+    class Composing(type(gym.make(POLE).unwrapped)):
+        def step(self, action):
+            self.do_simulation(action, self.frame_skip)
+            return np.concatenate([self.data.qpos, self.data.qvel]), 0.0, False, False, {}
+
+    wrapped = CorrectedEnv(CorrectedEnv(Composing(), [CoulombFriction("slider", level=0.4)]), [Bias("slider", b=0.5)])
+    assert wrapped.reset(seed=0)[0][0] > 0.4
+    with pytest.raises(ValueError, match="does not use _get_obs"):
+        wrapped.step(np.zeros(1))
+
+
 def test_physics_that_a_task_steps_by_itself_are_not_replaced_in_silence():
     class Windy(type(gym.make(POLE).unwrapped)):
         def _step_mujoco_simulation(self, ctrl, n_frames):

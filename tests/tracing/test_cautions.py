@@ -5,12 +5,21 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from simulated import PENDULUM, compiled, recorded
 
 from sb3_rpto.effects import LIBRARY, Simulation
 from sb3_rpto.effects.forces import Spring, TorqueOffset
 from sb3_rpto.tracing import Measurements, trace
-from sb3_rpto.tracing.cautions import above_noise, brief_delays, encoder_zeros, finer_steps, no_nearer, own_steps
-from sb3_rpto.tracing.evaluate import HorizonError
+from sb3_rpto.tracing.cautions import (
+    above_noise,
+    brief_delays,
+    encoder_zeros,
+    finer_steps,
+    missed,
+    no_nearer,
+    own_steps,
+)
+from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.windows import cut, discretised, noise_levels
 
@@ -31,6 +40,23 @@ def test_a_model_that_few_windows_pass_is_told_where_the_test_runs_deny_it(
     found = above_noise(errors, [FLOOR], ratio, length=0.8)
     assert [f.kind for f in found] == ["few windows"] * told
     assert above_noise(errors, [FLOOR], ratio, length=1.1) == []  # over so little the starts decide
+
+
+def test_a_light_joint_under_noise_for_commands_is_missed_by_the_model_of_another_load_alone() -> None:
+    light = PENDULUM.replace('mass="0.5"', 'mass="0.01"').replace('damping="0.05"', 'damping="0.005"')
+    commands = np.random.default_rng(4).uniform(-0.8, 0.8, (2, 210))
+    made = recorded(model=compiled(light), episodes=2, commands=commands, noise=1e-4, start=(0.2, 0.2), rate=100)
+    columns = {name: column for name, column in made.tables().items() if not name.startswith("qvel")}
+    data = Measurements.from_tables({"run": columns})
+    own, other = (
+        Simulation(discretised(compiled(xml), data, fine=True), [], 1)
+        for xml in (light, light.replace("0.01", "0.015"))
+    )
+    sigma = noise_levels(data)
+    after, floor = horizon_errors(own, own.null, data, sigma, 0), noise_floor(own, own.null, data, sigma, 0)
+    assert after[0].rmse > 10 * floor[0].rmse  # what smoothing shifts the starts by is no part of the floor
+    assert missed(own, own.null, data, sigma, 0) == []
+    assert [f.where for f in missed(other, other.null, data, sigma, 0)] == ["0, 1"]
 
 
 def test_what_explains_nothing_and_predicts_worse_is_told() -> None:

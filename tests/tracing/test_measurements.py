@@ -388,14 +388,38 @@ def bouncing():
         np.arange(1500.0),
     ],
 )
-def test_motion_is_no_jump(position):
+def test_motion_is_no_jump_and_no_glitch(position):
     assert not checks.jumps(TIME, position).any()
+    assert not checks.glitches(TIME, position).any()
 
 
-def test_rows_that_are_stamped_late_are_no_jump():
+def test_rows_that_are_stamped_late_are_no_jump_and_no_glitch():
     time = TIME.copy()
     time[[200, 600, 1100]] += 0.0095
     assert not checks.jumps(time, np.sin(2 * time)).any()
+    for position in (np.sin(2 * time), np.sin(2 * TIME)):
+        assert not checks.glitches(time, position).any()
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+@pytest.mark.parametrize("reading", [0.0, 99.9])
+def test_samples_that_are_no_readings_are_bridged_told_and_not_compared(reading, rows):
+    true = 3 + np.sin(2 * TIME) + 1e-3 * np.random.default_rng(0).normal(size=1500)
+    wrong = np.isin(np.arange(1500), [200 + k for k in range(rows)] + [777, 1100])
+    table = {"time": TIME, "qpos.slide": np.where(wrong, reading, true), "qpos.other": true}
+    data = Measurements.from_tables({"a": table})
+    (told,) = [finding for finding in data.findings if finding.kind not in ("missing velocity", "jump")]
+    assert (told.kind, told.where) == ("glitch", "a, qpos.slide")
+    assert told.message.startswith(
+        f"{rows + 2} sample(s) far from those before and after, the first {reading:.4g} at 2 s"
+    )
+    assert not [finding for finding in data.findings if finding.kind == "jump"]
+    (run,) = data.episodes
+    np.testing.assert_array_equal(run.usable, ~wrong)
+    np.testing.assert_array_equal(run.placed, ~wrong)
+    np.testing.assert_allclose(run.qpos[:, 0], true, rtol=0, atol=0.01)
+    np.testing.assert_array_equal(run.qpos[~wrong, 0], true[~wrong])
+    assert np.abs(run.qvel[:, 0]).max() < 2.1
 
 
 @given(st.integers(0, 2**32 - 1))

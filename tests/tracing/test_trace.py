@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import coarsely
 from gymnasium.envs.mujoco.inverted_double_pendulum_v5 import InvertedDoublePendulumEnv
-from simulated import PENDULUM, RATE, WITH_WHEEL, briefly, compiled, recorded
+from simulated import PENDULUM, RATE, WITH_WHEEL, briefly, compiled, recorded, torques
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_rpto.effects import LIBRARY, Effect, declare
@@ -115,6 +115,20 @@ def test_a_run_that_stalled_is_named_also_where_others_are_judged_on() -> None:
     assert stray.where == "run 0"
     assert stray.message.startswith("5 of 5 windows")
     assert report.effects[0].interval[0, 0] < 0.08 < report.effects[0].interval[1, 0]
+
+
+@pytest.mark.slow
+def test_a_run_to_select_on_that_never_comes_to_a_limit_does_not_hide_it_from_the_verdict() -> None:
+    limited = compiled(COARSE.replace('joint="hinge"/>', 'joint="hinge" forcelimited="true" forcerange="-.5 .5"/>'))
+    commands = np.stack([torques(1, 500, seed, size=0.3 if seed == 4 else 1.5, rate=100)[0] for seed in range(6)])
+    data = parted(
+        recorded(model=limited, episodes=6, duration=5.0, commands=commands, rate=100),
+        ["train"] * 4 + ["select"] + ["test"],
+    )
+    report = traced_simply(data, kinds=["command_saturation"])
+    assert report.judged_apart
+    assert report.verdict == "explained"
+    assert 1 / report.effects[0].effect.values == pytest.approx([0.5], rel=0.05)
 
 
 @pytest.mark.slow
