@@ -155,17 +155,30 @@ def undetermined(problem: Problem, values: np.ndarray, intervals: np.ndarray) ->
     return found
 
 
-def at_bounds(problem: Problem, values: np.ndarray) -> list[Finding]:
-    """What was given and ends at a bound that it did not begin at; nothing is below 0 of what cannot be negative."""
+def at_bounds(problem: Problem, values: np.ndarray, named: Sequence[int]) -> list[Finding]:
+    """What was fitted and ends at a bound that it did not begin at; nothing is below 0 of what cannot be negative.
+
+    :param named: indices of the effects that are kept
+    """
     found = []
-    owners = [(e, p) for e in problem.simulation.effects for p in e.parameters]
+    effects = problem.simulation.effects
+    owners = [(i, e, p) for i, e in enumerate(effects) for p in e.parameters]
     there = (values <= problem.lower) | (values >= problem.upper)
-    for i in np.flatnonzero(problem.known & there & (values != 0) & (values != problem.null)):
-        effect, parameter = owners[i]
-        is_number = isinstance(effect, Declared)
-        where = f"declared {effect.label}" if is_number else f"known {effect.label}, {parameter.name}"
-        message = f"{values[i]:.4g} is its bound; where the machine may lie beyond, give wider ones"
-        found.append(Finding("at its bound", where, message + (f" ({effect.label}=low:high)" if is_number else "")))
+    for at in np.flatnonzero(there & (values != 0) & (values != problem.null)):
+        i, effect, parameter = owners[at]
+        if not (effect.known or i in named):
+            continue
+        message = f"{values[at]:.4g} is its bound; "
+        if isinstance(effect, Declared):
+            where = f"declared {effect.label}"
+            message += f"where the machine may lie beyond, give wider ones ({effect.label}=low:high)"
+        elif effect.known:
+            where = f"known {effect.label}, {parameter.name}"
+            message += "where the machine may lie beyond, give wider ones"
+        else:
+            where = f"{effect.label}, {parameter.name}"
+            message += "the machine may lie beyond, or it stands in for something else"
+        found.append(Finding("at its bound", where, message))
     return found
 
 

@@ -41,6 +41,7 @@ _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # the first of the scalar ones
 _LIMIT = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)  # the first of limits and contacts
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _KNOWN_DYNAMICS = (int(mujoco.mjtDyn.mjDYN_NONE), *FILTERS)
+_NO_BIAS, _FIXED = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtGain.mjGAIN_FIXED)
 _MAX_LAG = 25
 _FEWEST = 30
 _BUDGET = 40_000  # samples in all: about two seconds for a small robot
@@ -229,7 +230,9 @@ def _clipped(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
 
 
 def doubts(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
-    """What may be wrong with recordings that nothing explains: angles in degrees, commands that never change."""
+    """What may be wrong with recordings that nothing explains, or with the model: angles in degrees, commands that never
+    change, motors whose force it limits.
+    """
     found, joints = [], hinges(model)
     for i, name in enumerate(data.columns.qpos):
         turns = float(np.median([np.ptp(e.qpos[:, i]) for e in data.episodes])) / (2 * np.pi)
@@ -244,6 +247,19 @@ def doubts(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
         if np.ptp(commands) == 0:
             message = f"it is {commands[0]:g} throughout; is that what the actuator was told?"
             found.append(Finding("constant command", f"{ALL}, ctrl.{name}", message))
+    for column, (name, i) in enumerate(zip(data.columns.ctrl, command_order(model, data))):
+        plain = model.actuator_biastype[i] == _NO_BIAS and model.actuator_dyntype[i] == _KNOWN_DYNAMICS[0]
+        if not (plain and model.actuator_forcelimited[i] and model.actuator_gaintype[i] == _FIXED):
+            continue
+        forces = model.actuator_gainprm[i, 0] * np.concatenate([e.ctrl[:, column] for e in data.episodes])
+        low, high = model.actuator_forcerange[i]
+        beyond = float(np.mean((forces < low) | (forces > high)))
+        if beyond > 0:
+            message = (
+                f"{beyond:.1%} of the samples ask for more than the model's forcerange [{low:g}, {high:g}], where it "
+                "limits the force: is that the machine's range?"
+            )
+            found.append(Finding("limited force", f"{ALL}, ctrl.{name}", message))
     return found
 
 

@@ -144,7 +144,7 @@ def trace(
         *too_short(errors_after, data),
         *_of_the_verdict(searched, problem, final, (errors_before, errors_after, floor), seed),
         *undetermined(problem, final, intervals),
-        *at_bounds(problem, final),
+        *at_bounds(problem, final, selection.model.effects),
         *strays(selector, final, set_up, found.after, seed),
         *encoder_zeros(simulation.model, [traced.effect for traced in kept]),
         *idle_start(late),

@@ -223,6 +223,14 @@ def test_angles_that_may_be_degrees_and_commands_that_never_change():
     ]
 
 
+@pytest.mark.parametrize(("most", "told"), [(0.3, True), (0.7, False)])
+def test_motors_whose_force_the_model_limits(most, told):
+    model = model_of()
+    model.actuator_forcelimited[1], model.actuator_forcerange[1] = 1, (-most, most)
+    found = doubts(model, Measurements.from_tables(measured(model_of())))  # commands of up to 0.6
+    assert [(f.kind, f.where) for f in found] == [("limited force", "all episodes, ctrl.second")] * told
+
+
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [("option.gravity", -9.81, "above 0, such as the model's 9.81"), ("shoulder.damping", -0.1, "at least 0")],

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import coarsely
 from gymnasium.envs.mujoco.inverted_double_pendulum_v5 import InvertedDoublePendulumEnv
-from simulated import PENDULUM, RATE, WITH_WHEEL, briefly, compiled, recorded, torques
+from simulated import PENDULUM, RATE, WITH_WHEEL, briefly, compiled, problem, recorded, torques
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_rpto.effects import LIBRARY, Effect, declare
@@ -25,6 +25,7 @@ from sb3_rpto.effects.library import given
 from sb3_rpto.experiments.planting import Planted, generate
 from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.adequacy import Adequacy, judge
+from sb3_rpto.tracing.cautions import at_bounds
 from sb3_rpto.tracing.prepare import LONGER, SetUp, prepare
 
 #: the longest steps that the recording and the trace may have
@@ -573,6 +574,13 @@ def test_a_declared_number_that_ends_at_its_bound_is_named() -> None:
     assert (finding.where, finding.message[:4]) == ("declared pole.mass", "0.4 ")
     assert "pole.mass=low:high" in finding.message
     assert "at its bound" not in {f.kind for f in wide.findings}
+
+
+def test_an_effect_that_ends_at_its_bound_is_named() -> None:
+    late = problem([CommandDelay("motor")], recorded(rate=100), compiled(COARSE))
+    (finding,) = at_bounds(late, late.upper, [0])
+    assert (finding.where, finding.message[:4]) == ("command_delay(motor), delay", "0.2 ")
+    assert at_bounds(late, late.upper, []) == []  # it is not kept
 
 
 def test_data_that_were_not_read_are_refused_at_once() -> None:
