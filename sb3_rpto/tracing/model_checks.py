@@ -230,9 +230,7 @@ def _clipped(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
 
 
 def doubts(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
-    """What may be wrong with recordings that nothing explains, or with the model: angles in degrees, commands that never
-    change, motors whose force it limits.
-    """
+    """What may be wrong where nothing explains recordings: angles in degrees, constant commands, limits of motors."""
     found, joints = [], hinges(model)
     for i, name in enumerate(data.columns.qpos):
         turns = float(np.median([np.ptp(e.qpos[:, i]) for e in data.episodes])) / (2 * np.pi)
