@@ -412,6 +412,7 @@ def test_a_search_is_judged_on_the_target(zoo, agent, tmp_path, monkeypatch):
     assert train.main([*options, *search, *judged, "--verbose", "0", "-params", "batch_size:16"]) == 0
     assert set(made) == {(False, SOURCE), (True, TARGET)}
     (report,) = (tmp_path / "rpo").glob("report_*.csv")
+    assert not [path for path in (tmp_path / "rpo").iterdir() if path.is_dir()]  # ``enjoy`` takes the newest
     with report.open() as stream:
         rows = list(csv.DictReader(stream))
     assert [row["state"] for row in rows] == ["COMPLETE", "COMPLETE"]

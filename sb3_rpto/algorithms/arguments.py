@@ -343,7 +343,7 @@ def _warn_of_little(model: TwoWorlds, total_timesteps: int) -> None:
         steps = model._steps_of_round()
         rounds = -(-total_timesteps // steps)
         updates = rounds * max(model.gradient_steps, 1)
-        if updates < FEW_UPDATES <= total_timesteps:
+        if not model._n_updates and updates < FEW_UPDATES <= total_timesteps:  # one that goes on was told
             warnings.warn(
                 f"total_timesteps={total_timesteps} source steps are {rounds} rounds of {steps} (source_steps="
                 f"{model.source_steps}) with gradient_steps={model.gradient_steps} updates each, {updates} in all; "

@@ -22,6 +22,8 @@ COUNT = 8
 class Progress(BaseCallback):
     """Writes the report before the policy learns, and now and then a checkpoint with a row of what the policy earns.
 
+    The first checkpoint, at once, has no row: it holds what was traced.
+
     It is no learning curve: there is no target, and the policy is judged in the corrected simulator, where that may.
 
     :param run: whose folder
@@ -45,6 +47,8 @@ class Progress(BaseCallback):
             say(verdict if self.quiet else f"{loop.reports[0]}\n\nwritten: {report}")
 
     def _on_step(self) -> bool:
+        if self.n_calls == 1 and not self.rows and self.num_timesteps < self.total // COUNT:
+            self.run.save_checkpoint(self.num_timesteps, self._write)
         taken = sum(self.num_timesteps >= self.total * n // COUNT for n in range(1, COUNT))
         if taken > len(self.rows) and self.num_timesteps < self.total:  # the last row is that of the end
             self._add_row()

@@ -10,6 +10,8 @@ from sb3_rpto.effects.world import World, add
 
 #: Half of what is left between stops that meet, for one unit of their place: six digits, as MJCF has, tell them apart.
 GAP = 1e-5
+#: Every count of periods that a motor's poles and slots, or a gear's teeth, may make in a turn, from 6.
+COUNTS = tuple(float(count - 6) for count in range(1, 49) if count != 6)
 
 
 @register
@@ -21,7 +23,7 @@ class TorqueRipple(Effect):
     parameters = (
         Parameter("cosine", "N·m", lambda s: 0.03 * s.torque),
         Parameter("sine", "N·m", lambda s: 0.03 * s.torque),
-        Parameter("turns", "1/rev", 1.0, lower=1.0, upper=48.0, null=6.0, shape=True),
+        Parameter("turns", "1/rev", 1.0, lower=1.0, upper=48.0, null=6.0, shape=True, starts=COUNTS),
     )
     equation = "cosine cos(turns q) + sine sin(turns q)"
     excite = "slow motion over a whole turn, in both directions"

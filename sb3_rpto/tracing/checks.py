@@ -29,6 +29,8 @@ TURN, FAST = 2 * np.pi, 0.05
 """A turn in rad; an angle is too fast for its samples where more than this share of its steps are about half a turn."""
 JUMP, RARE = 8.0, 0.02
 """A step is no motion where it is so many times faster than all others, and at most this share of them are."""
+ANSWER, SEVERAL = 0.1, 0.01
+"""What moves within so many seconds of an unusual command may answer it; at most this share of samples is bridged."""
 WINDOW = 9
 """Samples of the filter that differentiates positions."""
 
@@ -144,6 +146,23 @@ def glitches(time: np.ndarray, position: np.ndarray) -> np.ndarray:
         for k in first[(least > JUMP * np.maximum(change, np.quantile(change, 0.9))) & (least > far)]:
             wrong[k + 1 : k + 1 + rows] = True
     return wrong
+
+
+def after_commands(time: np.ndarray, commands: np.ndarray) -> np.ndarray:
+    """Samples at which a joint may go and come back at once, as a command has done so, (T,).
+
+    Twice it changed by more than twice the 90 % quantile of its changes, in the last tenth of a second or two samples,
+    whichever is longer.
+
+    :param time: increasing times in s, shape (T,)
+    :param commands: shape (T, nu)
+    """
+    changes = np.abs(np.diff(commands, axis=0))
+    unusual = np.flatnonzero((changes > 2 * np.quantile(changes, 0.9, axis=0)).any(axis=1))
+    found = np.zeros(len(time), dtype=int)
+    for k in unusual:  # between samples k and k + 1, which may have been recorded after it was sent
+        found[k : max(k + 4, int(np.searchsorted(time, time[k + 1] + ANSWER, "right")))] += 1
+    return found > 1
 
 
 def jumps(time: np.ndarray, position: np.ndarray) -> np.ndarray:

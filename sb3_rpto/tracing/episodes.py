@@ -358,17 +358,32 @@ def _unwrap_angles(episode: Episode, columns: Columns, tell: _Tell) -> None:
 
 
 def _bridge_glitches(episode: Episode, column: int, tell: _Tell, where: str) -> None:
-    """Interpolate samples of a position that are no readings, so that no velocity is made of them; none is compared."""
+    """Interpolate samples of a position that are no readings, so that no velocity is made of them; none is compared.
+
+    What may be motion is kept: many such samples, and those that may answer to a command, with all beside them.
+    """
     position = episode.qpos[:, column]
     wrong = checks.glitches(episode.time, position)
     if not wrong.any():
         return
-    first = int(np.argmax(wrong))
+    answering = checks.after_commands(episode.time, episode.ctrl)
+    for together in np.split(np.flatnonzero(wrong), np.flatnonzero(np.diff(np.flatnonzero(wrong)) > 1) + 1):
+        wrong[together] = not answering[together].any()
+    if not wrong.any():
+        return
+    first, few = int(np.argmax(wrong)), wrong.mean() <= checks.SEVERAL
     message = (
         f"{wrong.sum()} sample(s) far from those before and after, the first {position[first]:.4g} at "
-        f"{episode.time[first]:.4g} s; interpolated, and no prediction begins there or is compared"
+        f"{episode.time[first]:.4g} s; "
+    )
+    message += (
+        "interpolated, and no prediction begins there or is compared"
+        if few
+        else "kept, as they are many: where they are no readings, interpolate them, or drop them with their commands"
     )
     tell("glitch", message, where)
+    if not few:
+        return
     position[wrong] = np.interp(episode.time[wrong], episode.time[~wrong], position[~wrong])
     for known in (episode.usable, episode.placed):
         known[wrong] = False

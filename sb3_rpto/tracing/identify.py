@@ -67,6 +67,12 @@ class Linear:
     gradient: np.ndarray
     free: np.ndarray
 
+    def fall(self, rows: np.ndarray) -> float:
+        """How far the cost would fall by some of the free parameters if it were quadratic."""
+        normal, gradient = self.normal.sum(0)[np.ix_(rows, rows)], self.gradient.sum(0)[rows]
+        ridge = 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(rows))
+        return float(gradient @ np.linalg.solve(normal + ridge, gradient))
+
 
 class Problem:
     """Windows, and the simulation that is to predict them.

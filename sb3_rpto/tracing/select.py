@@ -12,8 +12,9 @@ from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.tracing import concentrate
 from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds, several_missed
-from sb3_rpto.tracing.identify import Fit, Linear, Problem
+from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.loss import FAR
+from sb3_rpto.tracing.shapes import places_to_begin
 from sb3_rpto.tracing.unseen import unseen_errors
 from sb3_rpto.tracing.windows import Windows, join
 
@@ -387,7 +388,7 @@ class Selector:
     def promise(self, model: Model, effects: Sequence[int]) -> float:
         """Share of the error that a model would save with all of some effects, if the cost were quadratic."""
         free = self.free([*effects, *model.effects])
-        saved = _fall(self.train.linear(model.fit, free), np.arange(len(free))) / model.fit.cost
+        saved = self.train.linear(model.fit, free).fall(np.arange(len(free))) / model.fit.cost
         return 1 - float(np.sqrt(max(0.0, 1 - saved)))
 
     def promising(self, model: Model, outside: Sequence[int]) -> list[tuple[int, Fit]]:
@@ -401,7 +402,8 @@ class Selector:
         gains, begins = {}, {}
         for e in self._promised(part, base, model.effects, outside):
             free = self.free([*model.effects, e])
-            trials = [(v, part.fit(v, free, base.starts, REFIT + 1)) for v in self._begins(base.values, e)]
+            tried = places_to_begin(part, base, self.free(model.effects), e)
+            trials = [(v, part.fit(v, free, base.starts, REFIT + 1)) for v in tried]
             values, fit = min(trials, key=lambda trial: trial[1].cost)
             gains[e] = max(float(np.mean(np.log(base.errors) - np.log(fit.errors))), 1 - fit.cost / base.cost)
             s = self.simulation.slices[e]
@@ -415,26 +417,9 @@ class Selector:
         every = self.free([*kept, *outside])
         linear = part.linear(base, every)
         rows = {e: np.flatnonzero(np.isin(every, self.free([*kept, e]))) for e in outside}
-        falls = {e: _fall(linear, rows[e]) for e in outside}
+        falls = {e: linear.fall(rows[e]) for e in outside}
         best = sorted(outside, key=lambda e: -falls[e])[:QUICK]
         return [e for e in outside if e in best or any(p.starts for p in self.simulation.effects[e].parameters)]
-
-    def _begins(self, values: np.ndarray, effect: int) -> list[np.ndarray]:
-        """The parameters with an effect's own where fits may start."""
-        found = [values]
-        s = self.simulation.slices[effect]
-        for i, parameter in enumerate(self.simulation.effects[effect].parameters, s.start):
-            for start in parameter.starts:
-                found.append(values.copy())
-                found[-1][i] = self.simulation.null[i] + start * self.train.size[i]
-        return found
-
-
-def _fall(linear: Linear, rows: np.ndarray) -> float:
-    """How far the cost would fall by some of the free parameters if it were quadratic."""
-    normal, gradient = linear.normal.sum(0)[np.ix_(rows, rows)], linear.gradient.sum(0)[rows]
-    ridge = 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(rows))
-    return float(gradient @ np.linalg.solve(normal + ridge, gradient))
 
 
 def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:

@@ -94,14 +94,14 @@ class TransferManager(ExperimentManager):
         self._drawn: dict[str, Any] = {}
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """As the zoo's; the folder of a run that could not begin is removed, lest ``enjoy`` takes it for the newest."""
-        had = Path(self.save_path).exists()
+        """As the zoo's; ``enjoy`` takes the newest folder, so that of a search, or of what could not begin, goes."""
+        had, begun = Path(self.save_path).exists(), None
         try:
-            return super().setup_experiment()
-        except BaseException:
-            if not had:
+            begun = super().setup_experiment()
+        finally:
+            if begun is None and not had:
                 shutil.rmtree(self.save_path, ignore_errors=True)
-            raise
+        return begun
 
     # ------------------------------------------------------------------ settings
 

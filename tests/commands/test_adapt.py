@@ -120,6 +120,15 @@ def test_a_run_ends_with_one_row_and_no_checkpoint_of_its_end(total: int, tmp_pa
     assert len({*rows}) == len(rows)
 
 
+def test_what_was_traced_is_in_a_checkpoint_at_once(tmp_path: Path) -> None:
+    seen: list[int] = []
+    folder = SimpleNamespace(save_checkpoint=lambda steps, write: seen.append(steps))
+    shown = Progress(folder, 5000, [], quiet=True)  # type: ignore[arg-type]
+    for shown.n_calls, shown.num_timesteps in ((1, 10), (2, 20)):
+        shown._on_step()
+    assert (seen, shown.rows) == ([10], [])
+
+
 def test_its_folder_is_enjoyed_in_the_corrected_simulator(given: Path, tmp_path: Path, capsys) -> None:
     run = tmp_path / "run"
     run.mkdir()
@@ -162,12 +171,13 @@ def test_what_is_known_is_fitted_and_not_found_again(given: Path, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_as_if_it_had_not_been(given: Path, tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize("rows", [0, 3])
+def test_a_killed_run_goes_on_as_if_it_had_not_been(given: Path, tmp_path: Path, monkeypatch, rows: int) -> None:
     assert adapt(given, tmp_path / "whole") == 0
-    add = Progress._add_row
+    add, traces = Progress._add_row, []
 
     def interrupted(self: Progress) -> None:
-        if len(self.rows) == 3:
+        if len(self.rows) == rows:
             raise KeyboardInterrupt
         add(self)
 
@@ -175,7 +185,9 @@ def test_a_killed_run_goes_on_as_if_it_had_not_been(given: Path, tmp_path: Path,
         patch.setattr(Progress, "_add_row", interrupted)
         assert adapt(given, tmp_path / "killed") == 130
     assert (tmp_path / "killed" / "report.html").exists()
+    monkeypatch.setattr(closing, "trace", lambda *args, **kwargs: traces.append(1) or 1 / 0)
     assert adapt(given, tmp_path / "killed") == 0
+    assert not traces
     one, other = (RPTO.load(tmp_path / name / "model.zip", device="cpu").policy for name in ("whole", "killed"))
     assert all(th.equal(a, b) for a, b in zip(one.parameters(), other.parameters(), strict=True))
     seen = [json.loads((tmp_path / name / "result.json").read_text())["rows"] for name in ("whole", "killed")]

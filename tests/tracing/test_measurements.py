@@ -401,6 +401,28 @@ def test_rows_that_are_stamped_late_are_no_jump_and_no_glitch():
         assert not checks.glitches(time, position).any()
 
 
+def taps(every: int) -> dict:
+    """A finger that taps within two samples when it is told to, and rests between."""
+    command = np.where(np.arange(1500) % every < 2, 0.5, 0.0)
+    position = np.roll(command, 1) + 1e-3 * np.random.default_rng(0).normal(size=1500)
+    return {"time": TIME, "qpos.finger": position, "ctrl.finger": command}
+
+
+def test_taps_that_a_command_asks_for_are_motion():
+    assert checks.glitches(TIME, taps(150)["qpos.finger"]).sum() == 18
+    assert "glitch" not in kinds(Measurements.from_tables({"a": taps(150)}))
+
+
+def test_many_samples_that_look_like_no_readings_are_kept():
+    table = {name: column for name, column in taps(150).items() if name != "ctrl.finger"}
+    data = Measurements.from_tables({"a": table})
+    (told,) = [finding for finding in data.findings if finding.kind == "glitch"]
+    assert "18 sample(s)" in told.message
+    assert "kept, as they are many" in told.message
+    assert data.episodes[0].usable.all()
+    np.testing.assert_array_equal(data.episodes[0].qpos[:, 0], table["qpos.finger"])
+
+
 @pytest.mark.parametrize("rows", [1, 2])
 @pytest.mark.parametrize("reading", [0.0, 99.9])
 def test_samples_that_are_no_readings_are_bridged_told_and_not_compared(reading, rows):
