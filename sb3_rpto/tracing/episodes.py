@@ -265,7 +265,7 @@ def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> No
     tell = _Tell(episode, findings)
     _look_at_samples(episode, columns, tell)
     _repair_orientations(episode, columns, tell)
-    _unwrap_angles(episode, columns, tell)
+    _repair_positions(episode, columns, tell)
     _complete_velocities(episode, columns, tell)
 
 
@@ -330,7 +330,8 @@ def _repair_orientations(episode: Episode, columns: Columns, tell: _Tell) -> Non
             tell.slope(checks.turning_slope(episode.time, oriented, measured), f"qvel.{joint}")
 
 
-def _unwrap_angles(episode: Episode, columns: Columns, tell: _Tell) -> None:
+def _repair_positions(episode: Episode, columns: Columns, tell: _Tell) -> None:
+    """Unwrap angles, bridge what is no reading, and tell of steps that are no motion."""
     for i, name in enumerate(columns.qpos):
         # A turn means nothing to the coordinates of a ball or free joint.
         if name != joint_of(name):

@@ -9,7 +9,8 @@ import numpy as np
 from sb3_rpto.tracing.identify import Fit, Linear, Problem
 from sb3_rpto.tracing.loss import Loss
 
-#: Of more starts than these, such as all counts of a cogging motor's poles, those that promise most are tried.
+#: Of more starts than these beside the null, such as all counts of a cogging motor's poles, so many are tried: those
+#: that promise most. They must be of a shape.
 TRIED = 3
 
 
