@@ -126,6 +126,7 @@ def test_statement_fails_on_some_random_mdp(name: str):
     assert not all(theory.STATEMENTS[name](draw(0, index)).holds for index in range(500))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in theory.STATEMENTS if name not in FAILS and "tight" in name])
 def test_tight_constants_resist_a_search(name: str):
     bound, _ = theory.worst_case(theory.STATEMENTS[name], seed=0, steps=1200)

@@ -122,6 +122,7 @@ SLOW_CASES = (
     "rpo-pendulum",
     "rto-pendulum",
     "rpto-physical",
+    "rpto-physical-mujoco",
     "rpo-mujoco",
     "rpto-residual",
     "rpto-gsde",

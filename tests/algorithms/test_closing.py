@@ -24,7 +24,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPTO, RTO
-from sb3_rpto.algorithms import arguments, closing, renewal, rounds
+from sb3_rpto.algorithms import arguments, closing, renewal, rounds, warm
 from sb3_rpto.algorithms.closing import LoopCloser, stays_finite
 from sb3_rpto.algorithms.rehearsals import Rehearsals
 from sb3_rpto.algorithms.renewal import outdated, renew_source
@@ -82,6 +82,26 @@ def learned() -> RPTO:
         assert made.loop is not None
         made.loop.on_report = lambda report: TOLD.append((report, made._n_updates))
         return made.learn(100, source_timesteps=100)
+
+
+@pytest.fixture(scope="module")
+def kept_on_a_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a model is kept that has learned on a log, traced for what was declared alone."""
+    folder = tmp_path_factory.mktemp("log")
+    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(renewal, "FILL", 25)
+        patch.setattr(warm, "FIRST_SOURCE_STEPS", 200)
+        made = model([], target_data=measured, close_loop=False, model_train_freq=20).learn(40, source_timesteps=0)
+    made.save(folder / "model")
+    made.save_replay_buffer(folder / "buffer")
+    return folder
+
+
+def on_a_log(kept: Path) -> RPTO:
+    made = RPTO.load(kept / "model", env=gym.make(TASK), device="cpu")
+    made.load_replay_buffer(kept / "buffer")
+    return made
 
 
 def dynamics(made: RPTO) -> PhysicalDynamics:
@@ -1294,22 +1314,22 @@ def test_after_a_log_the_best_policy_is_left_and_the_last_one_goes_on_learning(m
 
 
 def test_a_callback_that_stops_a_run_on_a_log_leaves_the_best_policy(
-    soon: None, monkeypatch: pytest.MonkeyPatch
+    kept_on_a_log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
-    made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)
+    made = on_a_log(kept_on_a_log)
     assert made.loop is not None
     assert made.loop.accounts
     finished: list[object] = []
     monkeypatch.setattr(made.loop, "finish", finished.append)
     made.learn(500, callback=lambda *_: made.num_timesteps < 200, reset_num_timesteps=False)
-    assert made.num_timesteps < 560
+    assert made.num_timesteps < 540
     assert finished == [made]
 
 
-def test_a_target_after_a_log_is_not_traced_where_nobody_asked(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
-    made = model([], target_data=measured, close_loop=False, model_train_freq=20).learn(40, source_timesteps=0)
+def test_a_target_after_a_log_is_not_traced_where_nobody_asked(
+    kept_on_a_log: Path, soon: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = on_a_log(kept_on_a_log)
     with pytest.warns(UserWarning, match="D_target loses"):
         made.set_target_env(target([]))
     with pytest.warns(UserWarning, match="ends before the first fit of the dynamics, after 20"):
@@ -1627,23 +1647,18 @@ def test_a_source_that_was_corrected_already_is_refused(soon: None, tmp_path: Pa
     assert made.env is before
 
 
-@pytest.mark.parametrize("first", ["the buffer", pytest.param("the target", marks=pytest.mark.slow)])
-def test_a_target_after_a_log_begins_without_the_logs_estimates(first: str, soon: None, tmp_path: Path) -> None:
-    measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
-    made = model([], target_data=measured).learn(40, source_timesteps=0)
-    made.save(tmp_path / "model")
-    made.save_replay_buffer(tmp_path / "buffer")
+@pytest.mark.parametrize("first", ["the buffer", "the target"])
+def test_a_target_after_a_log_begins_without_the_logs_estimates(first: str, kept_on_a_log: Path, tmp_path: Path) -> None:
     later = target([])
     loses = pytest.warns(UserWarning, match=r"D_target loses \d+ transitions of the log, whose states are estimates")
     if first == "the buffer":
-        made = RPTO.load(tmp_path / "model", env=gym.make(TASK), device="cpu")
-        made.load_replay_buffer(tmp_path / "buffer")
+        made = on_a_log(kept_on_a_log)
         with loses:
             made.set_target_env(later)
     else:
-        made = RPTO.load(tmp_path / "model", env=gym.make(TASK), target_env=later, device="cpu")
+        made = RPTO.load(kept_on_a_log / "model", env=gym.make(TASK), target_env=later, device="cpu")
         with loses:
-            made.load_replay_buffer(tmp_path / "buffer")
+            made.load_replay_buffer(kept_on_a_log / "buffer")
     assert made.replay_buffer.target.size() == made.replay_buffer.target_added == 0
     assert made.replay_buffer.source.size() > 0
     made.save_replay_buffer(tmp_path / "later")

@@ -314,6 +314,7 @@ def test_the_deviation_shrinks_with_the_data():
     }
 
 
+@pytest.mark.slow
 def test_what_is_too_faint_to_tell_is_named_and_stays_where_it_was():
     data = noisy(collect(shifted(HOPPER), 60), 0.1)
     model = dynamics(HOPPER, ["*.mass", "*.armature"])

@@ -162,8 +162,9 @@ def test_given_source_data_cost_no_source_steps(source_model: str, source_data: 
     assert [row["source_steps"] for row in rows] == [0] * 4
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("method", ["rpto", *(pytest.param(m, marks=pytest.mark.slow) for m in ("slbo", "ptp"))])
+@pytest.mark.parametrize("method", ["rpto", "slbo", "ptp"])
 def test_phi_0_is_fitted_once_and_is_what_a_run_fits_by_itself(
     method: str, source_model: str, source_data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
