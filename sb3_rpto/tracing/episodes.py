@@ -97,7 +97,7 @@ def runs_of(file: str, table: Table) -> dict[str | None, dict[str, np.ndarray]]:
     """Check the values of a table and part its rows by episode."""
     lengths = {name: np.shape(values) for name, values in table.items()}
     if len(set(lengths.values())) != 1 or len(lengths["time"]) != 1:
-        raise ValueError(f"{file}: columns must all have one shape (T,); got {lengths}")
+        raise ValueError(f"{file}: columns must all have one shape (T,), a value for each time; got {lengths}")
     if "episode" in table and lengths["time"] == (0,):
         raise ValueError(f"{file}: the table has no rows; give one row a sample")
     rows: dict[str, np.ndarray] = {}

@@ -96,12 +96,12 @@ def render(report: Report) -> str:
 
 
 def _verdict(report: Report) -> str:
-    means, caution = wording.VERDICTS[report.verdict]
+    means, caution = wording.verdict(report.verdict, searched=bool(report.candidates))
     before, after = report.adequacy_before, report.adequacy_after
     idle = sum(c.status == "not excited" for c in report.candidates)
     said = "<br>".join(escape(sentence) for sentence in (means, *wording.rest(after), caution))
     verdict = f"<b>{escape(report.verdict.capitalize())}.</b> {said}"
-    apart = "that were not fitted" if report.judged_apart else "that were fitted, as those set apart show too little"
+    apart = "that were not fitted" if report.judged_apart else f"that were fitted, {wording.not_apart(report.runs)}"
     ratios = [f"<b>{escape(str(a).removeprefix('R = '))}</b>" for a in (before, after)]
     lines = [
         f'<div class="verdict">{verdict}</div>',

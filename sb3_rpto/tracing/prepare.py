@@ -160,7 +160,7 @@ def prepare(
     sigma = noise_levels(fitted)
     changes = contact_changes(compiled, fitted)
     touching = changes > OFTEN
-    length = _horizon(fitted, touching) if horizon is None else horizon
+    length = _horizon(fitted, touching) if horizon is None else float(horizon)
     if touching and horizon is None:
         message = f"{changes:.1f} a second come or go; windows of {length:.2g} s, as errors about a touch-down grow"
         findings.append(Finding("contacts", "fitted runs", message))
@@ -188,6 +188,9 @@ def prepare(
             column = f"param.{settings[one.number]}"
             raise ValueError(f"declared {one.label!r} is the column {column!r} of the data, too; leave one of them out")
     effects = [*there, *_candidates(nominal, there, kinds, data.exact)]
+    nowhere = [kind for kind in kinds or () if not LIBRARY[kind].places(nominal)]
+    message = "named among the candidates, but nothing in this model can have it: it is not looked for"
+    findings += [Finding("no place", kind, message) for kind in dict.fromkeys(nowhere)]
     for effect in effects:
         if not type(effect).__module__.startswith("sb3_rpto."):
             try_out(nominal, effect)

@@ -231,7 +231,7 @@ class Report:
         return zeros_of(self.simulation, self.values_after, data, self.sigma, self.horizon, self.zeros.joints)
 
     def __str__(self) -> str:
-        means, _ = wording.VERDICTS[self.verdict]
+        means, _ = wording.verdict(self.verdict, searched=bool(self.candidates))
         said = [f"  {sentence}" for sentence in (means, *wording.rest(self.adequacy_after))]
         lines = [f"verdict: {self.verdict}", *said, "", "model", f"  {self.equation()}"]
         for what, is_number in (("declared parameters", True), ("known effects", False)):
@@ -247,7 +247,7 @@ class Report:
                 "encoder zeros that differ by run, rad or m: spread, and each",
                 *wording.aligned(self.zeros.rows()),
             ]
-        apart = "on select windows" if self.judged_apart else "on fitted windows, as those set apart show too little"
+        apart = "on select windows" if self.judged_apart else f"on fitted windows, {wording.not_apart(self.runs)}"
         lines += ["", f"adequacy R: error over that of noise alone, {apart}; 1 where nothing is missing"]
         lines += [f"  before {self.adequacy_before}, after {self.adequacy_after}"]
         tested = "test runs" if self.runs["test"] else "the fitted runs, as there are no test runs"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -261,7 +262,8 @@ def _check_arguments(
         )
     if isinstance(candidates, str):
         raise TypeError(f"candidates must be a list of kinds, not the string {candidates!r}; write [{candidates!r}]")
-    if horizon is not None and not (isinstance(horizon, float | int) and 0 < horizon < np.inf):
+    number = isinstance(horizon, Real) and not isinstance(horizon, bool)
+    if horizon is not None and not (number and 0 < horizon < np.inf):
         raise ValueError(f"horizon is {horizon!r}; give a time in s above 0, or None")
     for name, value in (("seed", seed), ("calibrate", calibrate), ("threads", threads)):
         if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 0:

@@ -7,8 +7,8 @@ import numpy as np
 from sb3_rpto.effects import Declared, Scales, Simulation
 from sb3_rpto.effects.library import candidates
 from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.identify import SETTLED, Problem
-from sb3_rpto.tracing.misread import CLEARLY, FITTED, ITERATIONS, WINDOWS
+from sb3_rpto.tracing.identify import Problem
+from sb3_rpto.tracing.misread import CLEARLY, FITTED, ITERATIONS, WINDOWS, least_error
 from sb3_rpto.tracing.prepare import SetUp
 from sb3_rpto.tracing.search import Found
 from sb3_rpto.tracing.windows import cut
@@ -29,7 +29,8 @@ def undeclared_mass(found: Found, set_up: SetUp) -> list[Finding]:
     simulation, selection = train.simulation, found.selection
     windows = cut(simulation.model, data, set_up.sigma, found.on.fine.horizon, WINDOWS)
     begins = (selection.model.fit.values, found.base.fit.values)  # what was found may make up for the mass
-    usual = Problem(simulation, windows, train.scales).score(begins[0], iterations=SETTLED)
+    free = found.on.fine.free(selection.model.effects)
+    usual = least_error(Problem(simulation, windows, train.scales), begins, free)
     declared = [effect.label for effect in simulation.effects if isinstance(effect, Declared)]
     tried = []
     for mass in candidates(set_up.nominal, declared, {"mass_scale"}):
@@ -37,11 +38,10 @@ def undeclared_mass(found: Found, set_up: SetUp) -> list[Finding]:
         there = Problem(wider, windows, [*train.scales, Scales()])
         for values in (np.append(begin, change) for begin in begins for change in LOOKS):
             tried.append((float(np.median(there.score(values).errors)), values, there, mass.on))
-    free = np.append(found.on.fine.free(selection.model.effects), simulation.size)
     best, share = None, CLEARLY
     for _, values, there, body in sorted(tried, key=lambda one: one[0])[:FITTED]:
-        fit = there.fit(values, free, iterations=ITERATIONS)
-        if (now := float(np.median(fit.errors) / np.median(usual.errors))) < share:
+        fit = there.fit(values, np.append(free, simulation.size), iterations=ITERATIONS)
+        if (now := float(np.median(fit.errors)) / usual) < share:
             best, share = (body, 1 + fit.values[-1]), now
     if best is None:
         return []

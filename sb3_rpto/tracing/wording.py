@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -49,6 +49,26 @@ def rest(after: Adequacy) -> list[str]:
         return [f"The typical window errs by no more than noise: what remains is in {few} of windows."]
     share = percent(after.ratio - 1)
     return [f"What remains is small: the typical window errs by {share} more than noise alone makes it."]
+
+
+def verdict(verdict: str, searched: bool) -> tuple[str, str]:
+    """What a verdict says, and what to keep in mind with it.
+
+    :param verdict: of the report
+    :param searched: whether there were candidates
+    """
+    says, caution = VERDICTS[verdict]
+    if verdict == "unexplained" and not searched:
+        return "The model does not fit the data; no effects were looked for.", caution
+    return says, caution
+
+
+def not_apart(runs: Mapping[str, Sequence[str]]) -> str:
+    """Why windows that were fitted are judged.
+
+    :param runs: those to train, to select and to test on
+    """
+    return "as those set apart show too little" if runs["select"] else "as no run is set apart to select on"
 
 
 def means(data: Measurements) -> str:

@@ -1648,7 +1648,9 @@ def test_a_source_that_was_corrected_already_is_refused(soon: None, tmp_path: Pa
 
 
 @pytest.mark.parametrize("first", ["the buffer", "the target"])
-def test_a_target_after_a_log_begins_without_the_logs_estimates(first: str, kept_on_a_log: Path, tmp_path: Path) -> None:
+def test_a_target_after_a_log_begins_without_the_logs_estimates(
+    first: str, kept_on_a_log: Path, tmp_path: Path
+) -> None:
     later = target([])
     loses = pytest.warns(UserWarning, match=r"D_target loses \d+ transitions of the log, whose states are estimates")
     if first == "the buffer":

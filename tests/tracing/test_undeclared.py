@@ -3,11 +3,35 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import pytest
+from simulated import PENDULUM, briefly, recorded
 
+from sb3_rpto.effects import LIBRARY
 from sb3_rpto.experiments.planting import generate
 from sb3_rpto.tracing import trace
+from sb3_rpto.tracing.prepare import prepare
+from sb3_rpto.tracing.search import Found, Selection
+from sb3_rpto.tracing.undeclared import undeclared_mass
+
+
+@pytest.mark.parametrize(
+    ("damping", "mass", "bodies"), [(0.5, 0.5, []), (0.05, 0.4, ["pole"])], ids=["fitted anew", "another mass"]
+)
+def test_a_mass_is_not_named_for_what_fitting_the_declared_numbers_does(
+    damping: float, mass: float, bodies: list[str]
+) -> None:
+    xml = PENDULUM.replace('mass="0.5"', f'mass="{mass}"').replace('damping="0.05"', f'damping="{damping}"')
+    set_up = prepare(xml, recorded(), ["hinge.damping"], 0, [], 0.35, 1)
+    on = set_up.selectors(0.35, lambda share, what: None)
+    fit = on.fine.train.fit(on.fine.simulation.null, on.fine.free(()), iterations=1)
+    base = on.fine.model((), fit)
+    base = replace(base, fit=replace(base.fit, values=on.fine.simulation.null))  # not fitted as well as it may be
+    hints = undeclared_mass(Found(on, base, None, None, Selection(base), None), set_up)  # type: ignore[arg-type]
+    assert [hint.where for hint in hints] == bodies
+    for hint in hints:
+        assert float(hint.message.split()[1]) == pytest.approx(0.5 / mass, rel=0.02)
 
 
 @pytest.mark.slow
@@ -26,3 +50,11 @@ def test_a_mass_that_was_not_declared_is_named_with_its_size() -> None:
     assert float(hint.message.split()[1]) == pytest.approx(times, rel=0.02)
     assert "declare pole.mass" in hint.message
     assert trace(xml, planted.measurements, planted.declared, candidates=["coulomb_friction"]).verdict == "complete"
+
+
+def test_candidates_that_the_model_has_no_place_for_are_named() -> None:
+    data = recorded([LIBRARY["coulomb_friction"]("hinge", level=0.3)])
+    report = briefly(PENDULUM, data, ["hinge.damping"], ["wind"])
+    assert report.verdict == "unexplained"
+    assert [finding.where for finding in report.findings if finding.kind == "no place"] == ["wind"]
+    assert "no effects were looked for" in str(report)
