@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import pathlib
 import pickle
+import zipfile
 from functools import partial
 from typing import Any, Literal
 
@@ -279,7 +280,7 @@ def load_transitions(
             )
         arrays = chronological(buffer.side(world) if isinstance(buffer, DualReplayBuffer) else buffer)
     if len(arrays["observations"]) == 0:
-        raise ValueError("the transitions to load are empty")
+        raise ValueError("the transitions to load are empty; give at least one")
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"{name} of the loaded transitions hold NaN or infinite values; remove those rows")
@@ -307,7 +308,11 @@ def _load_npz(path: str | pathlib.Path, rewards_optional: bool) -> dict[str, np.
         "rewards": "rew",
         "terminations": "done",
     }
-    with np.load(path) as file:
+    try:
+        opened = np.load(path)
+    except (ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise ValueError(f"{str(path)!r} is no .npz file ({error}); write one by numpy.savez") from error
+    with opened as file:
         missing = set(names.values()) - set(file.files)
         if missing - ({"rew"} if rewards_optional else set()):
             raise ValueError(f"{path} lacks the arrays {sorted(missing)}; expected obs, act, next_obs, rew, done")

@@ -20,6 +20,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_rpto import RPO, RPTO
+from sb3_rpto.algorithms.worlds import NotFiniteError
 from sb3_rpto.envs import tasks
 from sb3_rpto.experiments.methods import REGISTRY
 from sb3_rpto.presets import preset_names, resolve_preset
@@ -214,7 +215,7 @@ def test_another_seed_begins_new_streams(trained):
 
 
 def test_worlds_are_as_they_were_where_a_run_goes_on(zoo, tmp_path, capsys):
-    from sb3_rpto.zoo.manager import settings_beside
+    from sb3_rpto.zoo.settings import settings_beside
 
     begun = launch(tmp_path, "rpo", "-n", "4", "--source-timesteps", "120", "--eval-freq", "-1", *COLD, "n_envs:2")
     capsys.readouterr()
@@ -417,12 +418,56 @@ def test_a_search_is_judged_on_the_target(zoo, agent, tmp_path, monkeypatch):
         rows = list(csv.DictReader(stream))
     assert [row["state"] for row in rows] == ["COMPLETE", "COMPLETE"]
     assert all(float(row["value"]) > 0 and 1 <= int(row["params_gradient_steps"]) <= 40 for row in rows)
-    again = launch(
-        tmp_path, "rpo", "--source-model", str(agent), "-n", "4", "--eval-freq", "-1", *study, "--trial-id", "1"
-    )
-    model = RPO.load(final(again), device="cpu")
-    assert model.gradient_steps == int(rows[1]["params_gradient_steps"])
-    assert model.lr_schedule(1.0) == pytest.approx(float(rows[1]["params_learning_rate"]))  # not the source agent's
+    training = ["--source-model", str(agent), "-n", "4", "--eval-freq", "-1", *study]
+    for number, row in enumerate(rows):
+        model = RPO.load(final(launch(tmp_path, "rpo", *training, "--trial-id", str(number))), device="cpu")
+        assert model.gradient_steps == int(row["params_gradient_steps"])
+        assert model.lr_schedule(1.0) == pytest.approx(float(row["params_learning_rate"]))  # not the source agent's
+    with pytest.raises(ValueError, match="--trial-id 2: study 'small' has fewer trials"):
+        launch(tmp_path, "rpo", *training, "--trial-id", "2")
+    with pytest.raises(ValueError, match="holds no study 'other'"):
+        launch(tmp_path, "rpo", *training, "--study-name", "other", "--trial-id", "1")
+
+
+def searched(folder: Path, agent: Path, *options: str) -> list[dict[str, str]]:
+    """Trials of a search with RPO, by its report."""
+    common = ["--algo", "rpo", "--env", TARGET, "-f", str(folder), "--source-model", str(agent), "--seed", "1"]
+    search = ["-optimize", "--n-trials", "2", "--sampler", "random", "--pruner", "none", "--no-optim-plots"]
+    judged = ["-n", "4", "--n-evaluations", "1", "--eval-episodes", "1", "--device", "cpu", "--verbose", "0"]
+    assert train.main([*common, *search, *judged, *options]) == 0
+    (report,) = (folder / "rpo").glob("report_*.csv")
+    with report.open() as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_a_trial_is_worth_what_the_policy_earns_at_its_end(zoo, agent, tmp_path, monkeypatch):
+    from sb3_rpto.zoo import manager
+
+    made, earned = [], iter([7.0, 5.0])
+
+    def evaluated(model, *args):
+        made.append((model.num_timesteps, model._n_updates - 4 * model.gradient_steps, model.gradient_steps))
+        return next(earned), 0.0
+
+    monkeypatch.setattr(manager, "evaluate_policy", evaluated)
+    rows = searched(tmp_path, agent, "-params", "gradient_steps:3")
+    assert [float(row["value"]) for row in rows] == [7.0, 5.0]
+    assert made == [(4, 0, 3)] * 2  # after the updates of the last step; -params wins over what is drawn
+
+
+def test_what_a_trial_drew_may_prune_it_and_a_wrong_setting_ends_the_search(zoo, agent, tmp_path, monkeypatch):
+    def fails(error):
+        def learn(self, *args, **kwargs):
+            raise error
+
+        monkeypatch.setattr(RPO, "learn", learn)
+
+    fails(ValueError("a callback in the wrong place"))
+    with pytest.raises(ValueError, match="wrong place"):
+        searched(tmp_path, agent)
+    fails(NotFiniteError("the source environment returned nan"))
+    with pytest.raises(ValueError, match="no trial of the search was completed"):
+        searched(tmp_path, agent)
 
 
 # ---------------------------------------------------------------------- wrong arguments
@@ -439,6 +484,7 @@ def test_a_search_is_judged_on_the_target(zoo, agent, tmp_path, monkeypatch):
         (["--env", TARGET, "-optimize"], "-optimize needs --source-model"),
         (["--env", TARGET, "--algo", "rto", "--source-model", __file__, "-optimize"], "leaves the policy as it is"),
         (["--env", TARGET, "--source-model", __file__, "-i", "some.zip"], "leave one of them out"),
+        (["--env", TARGET, "--trial-id", "0"], "--trial-id 0 needs the --storage and the --study-name"),
         (["--env", TARGET, "--algo", "sac", "--source-model", __file__], "--algo sac has one world"),
     ],
 )

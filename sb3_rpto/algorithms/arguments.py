@@ -288,7 +288,9 @@ def _check_counts(**values: Any) -> None:
             raise ValueError(f"{name} must be a positive integer, got {value!r}")
 
 
-def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | None) -> None:
+def check_ready(
+    model: TwoWorlds, total_timesteps: int, source_timesteps: int | None, log_interval: int | None = None
+) -> None:
     """Refuse to learn without both worlds or with a budget that makes no sense; arguments as those of ``learn()``.
 
     :raises ValueError: naming what is missing or wrong
@@ -311,6 +313,8 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
         )
     if source_timesteps is not None and (not _is_integer(source_timesteps) or source_timesteps < 0):
         raise ValueError(f"source_timesteps must be an integer and not negative, got {source_timesteps!r}")
+    if log_interval == 0:
+        raise ValueError("log_interval is 0; give the target episodes between two logs, or None to log nothing")
     if model._offline and not model._traces_log and model.replay_buffer.target.size() == 0:
         raise ValueError("D_target is empty: a checkpoint does not hold the target_data; call load_replay_buffer()")
     _warn_of_little(model, total_timesteps)

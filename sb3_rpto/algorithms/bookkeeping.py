@@ -141,7 +141,8 @@ class TwoWorlds(PolicySnapshots):
                 self.loop.forget_target()
             self._drop_target_data()
         if self.target_env is not None or self._offline:
-            self._round_open, self._collected, self._rollout_began_at = False, 1, self.num_timesteps
+            self._round_open, self._collected, self._source_due = False, 1, 0
+            self._rollout_began_at = self.num_timesteps
             if self._resume_state is not None:
                 # Where that target stood, and a step of it that is not stored.
                 self._resume_state |= {"target": None, "last_obs": None, "unstored_step": None}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+
 from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.tracing import Measurements
@@ -40,6 +42,25 @@ class Looping(Resumable):
             self.fit_dynamics()
         else:
             super().update()
+
+    def _source_steps_to_take(self) -> int:
+        """Those for the target steps of the next rollout; of whole episodes, as many as in the last one.
+
+        Steps that several copies took beyond those wanted, and those of a rollout that was another, are made up for.
+        """
+        assert isinstance(self.train_freq, TrainFreq)  # SB3's setup has made it one
+        if self._offline:  # the budget is one of source steps then
+            return min(self._source_due + self._steps_of_round(), self._steps_left())
+        come = min(self._collected, self._steps_left())
+        if self.train_freq.unit == TrainFrequencyUnit.STEP:
+            assert self.target_env is not None
+            come = self._rollout_length().frequency * self.target_env.num_envs
+        return self._source_due + come * self._steps_of_round()
+
+    def _count_for_fit(self) -> None:
+        if not self.learns_at_fits():
+            self._source_due += self._collected * self._steps_of_round()
+        super()._count_for_fit()
 
     def fresh_steps(self) -> int:
         """Source steps for the updates of a target step in a simulator that is new to the policy, of all its copies."""

@@ -207,6 +207,7 @@ class TransferAlgorithm(Looping):
         self._pretrained_steps = 0
         self._actor_updates = 0
         self._collected = 1
+        self._source_due = 0
         self._since_fit = 0
         self._rollout_began_at = 0
         self._round_open = False
@@ -333,7 +334,8 @@ class TransferAlgorithm(Looping):
     ) -> Self:
         """Transfer the policy: Algorithm 1 (RPTO), or the part of it that the class stands for.
 
-        :param total_timesteps: budget of TARGET steps (with ``target_data``: of source steps); never exceeded
+        :param total_timesteps: budget of TARGET steps, never exceeded (with ``target_data``: of source steps, and
+            all copies take their last one)
         :param callback: as in SB3; called once per target step
         :param log_interval: target episodes between two logs
         :param tb_log_name: name of the TensorBoard run, by default the class's name
@@ -343,7 +345,7 @@ class TransferAlgorithm(Looping):
             default 10 x ``total_timesteps``, at most 300,000; 0 skips the phase
         :raises ValueError: without a target, or for a budget that is not positive
         """
-        arguments.check_ready(self, total_timesteps, source_timesteps)
+        arguments.check_ready(self, total_timesteps, source_timesteps, log_interval)
         if source_timesteps is None:
             source_timesteps = min(10 * total_timesteps, 300_000)
         if not self._warm:
@@ -387,7 +389,7 @@ class TransferAlgorithm(Looping):
         :param forget: a new run begins
         """
         if forget:
-            self._round_open = False
+            self._round_open, self._source_due = False, 0
         if self._round_open and not self._offline:
             taken = self.num_timesteps - self._rollout_began_at
             if not taken:
@@ -406,13 +408,9 @@ class TransferAlgorithm(Looping):
 
     def interact_with_source(self) -> None:
         """Step 3: act in the source P_phi, ``source_steps`` times for each target step, and fill D_source."""
-        if self.learns_at_fits():
-            return
         assert self._source_world is not None  # learn() has made it
-        n_steps = self._collected * self._steps_of_round()
-        if self._offline:  # the budget is one of source steps then
-            n_steps = min(n_steps, self._steps_left())
-        self._source_world.interact(self, n_steps)
+        if not self.learns_at_fits() and (n_steps := self._source_steps_to_take()) > 0:
+            self._source_due -= self._source_world.interact(self, n_steps)
 
     def interact_with_target(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Step 4: act in the target and fill D_target; SB3's own code collects, within the budget.

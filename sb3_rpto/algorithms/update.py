@@ -62,6 +62,8 @@ class RelativeUpdate(SAC):
     #: target steps taken in the last rollout (with recorded target data: calls of the source), those since the last
     #: fit, and actor updates so far
     _collected: int
+    #: source steps that these are still to be matched with in step 3; negative: taken in advance
+    _source_due: int
     _since_fit: int
     _actor_updates: int
     #: recorded data stand in for the target

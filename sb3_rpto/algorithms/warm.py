@@ -116,7 +116,7 @@ def carry_over(sac: SAC, model: Resumable, temperature: bool = True) -> None:
 
 def fill_source(model: Resumable, source_data: ReplayBuffer | str | pathlib.Path) -> None:
     """Put recorded source transitions into D_source; branches may start from their states."""
-    arrays = _checked(load_transitions(source_data), model, "source_data")
+    arrays = _loaded(source_data, model, "source_data")
     model.replay_buffer.resize("source", max(model.buffer_size, len(arrays["rewards"])))
     _append_newest(model, "source", arrays)
     model.replay_buffer.source_starts = arrays["observations"].astype(model.observation_space.dtype)
@@ -127,7 +127,7 @@ def fill_target(model: Resumable, target_data: ReplayBuffer | str | pathlib.Path
     if isinstance(target_data, Measurements):
         fill_recorded(model, target_data)
         return
-    arrays = _checked(load_transitions(target_data, "target", rewards_optional=True), model, "target_data")
+    arrays = _loaded(target_data, model, "target_data", world="target", rewards_optional=True)
     _append_newest(model, "target", _with_rewards(model, arrays))
 
 
@@ -281,12 +281,17 @@ def _carry_optimizer(theirs: th.optim.Optimizer, ours: th.optim.Optimizer) -> No
         ours.load_state_dict({**state, "param_groups": ours.state_dict()["param_groups"]})
 
 
-def _checked(arrays: dict[str, np.ndarray], model: Resumable, name: str) -> dict[str, np.ndarray]:
+def _loaded(data: Any, model: Resumable, name: str, **how: Any) -> dict[str, np.ndarray]:
     """The recorded transitions, unless they are not of this model's environments.
 
     :param name: of the argument that they were passed as
-    :raises ValueError: for other shapes and for actions that are not on the buffers' scale
+    :param how: as of :func:`~sb3_rpto.buffers.load_transitions`
+    :raises ValueError: for what holds none, for other shapes and for actions that are not on the buffers' scale
     """
+    try:
+        arrays = load_transitions(data, **how)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
     of_observation, of_action = model.observation_space.shape, model.action_space.shape
     expected = {"observations": of_observation, "next_observations": of_observation, "actions": of_action}
     for array, values in arrays.items():

@@ -279,14 +279,18 @@ def check_environment(env: gym.Env | VecEnv, name: str) -> None:
         )
 
 
+class NotFiniteError(ValueError):
+    """A world answered with NaN or infinity."""
+
+
 def check_finite(world: str, **arrays: np.ndarray) -> None:
     """Refuse NaN and infinity before they reach a buffer.
 
-    :raises ValueError: naming the world and the offending values
+    :raises NotFiniteError: naming the world and the offending values
     """
     for name, array in arrays.items():
         if not np.isfinite(array).all():
-            raise ValueError(
+            raise NotFiniteError(
                 f"the {world} environment returned, as {name}, what is not finite: {array}; "
                 "mend the environment (stable_baselines3.common.vec_env.VecCheckNan finds the step)"
             )

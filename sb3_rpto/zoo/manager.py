@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import shutil
 import sys
 import warnings
@@ -15,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import optuna
-import yaml
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.exp_manager import ExperimentManager
@@ -24,14 +23,18 @@ from rl_zoo3.utils import get_callback_list
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
 from sb3_rpto.algorithms.bookkeeping import TARGET_SEED_OFFSET
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.algorithms.warm import carried_arguments, check_source_spaces, load_sac
+from sb3_rpto.algorithms.worlds import NotFiniteError
 from sb3_rpto.zoo.samplers import SAMPLERS
-from sb3_rpto.zoo.settings import ALGORITHMS, section, shipped_file, source_of
+from sb3_rpto.zoo.settings import ALGORITHMS, section, settings_beside, shipped_file, source_of, target_beside
 
+#: What torch says where an actor's numbers are not finite.
+INVALID = "found invalid values"
 #: Settings that no model carries: of the worlds, and of what is called beside the training.
 OUTSIDE = ("n_envs", "normalize", "env_wrapper", "monitor_kwargs", "callback")
 
@@ -111,6 +114,8 @@ class TransferManager(ExperimentManager):
         A run that goes on has the worlds of the ``config.yml`` that the zoo left beside its zip, unless it is told
         otherwise.
         """
+        if self.start is not None and self.trial_id == 0:  # the zoo takes that for none
+            self.load_trial(self.storage, self.study_name, self.trial_id)
         env_name = self.env_name
         if self._shipped is not None:
             self.env_name = type(env_name)(section(env_name.gym_id))
@@ -118,8 +123,7 @@ class TransferManager(ExperimentManager):
             hyperparams, saved = super().read_hyperparameters()
         finally:
             self.env_name = env_name
-        told = set(self.custom_hyperparams or ()) - {"dynamics_kwargs"}  # -params wins, as in the zoo; these are joined
-        drawn = _applicable({n: value for n, value in self._drawn.items() if n not in told}, hyperparams)
+        drawn = _applicable(self._not_told(self._drawn), hyperparams)
         for settings in (hyperparams, saved):
             settings.update(drawn)
         if self.resumes and self.start is not None:
@@ -135,13 +139,25 @@ class TransferManager(ExperimentManager):
         """As the zoo's; a trial's parameters win over what a source agent brings along.
 
         With two worlds they join the settings as in the search, :meth:`read_hyperparameters` sees to that.
+
+        :raises ValueError: there is no such study, or no such trial in it
         """
-        found = super().load_trial(*args, **kwargs)
+        try:
+            found = super().load_trial(*args, **kwargs)
+        except KeyError:
+            raise ValueError(f"--storage {self.storage} holds no study {self.study_name!r}: see --study-name") from None
+        except IndexError:
+            raise ValueError(f"--trial-id {self.trial_id}: study {self.study_name!r} has fewer trials") from None
         self._asked |= found.keys()
         if self.start is None:
             return found
         self._drawn = found
         return {}
+
+    def _not_told(self, drawn: dict[str, Any]) -> dict[str, Any]:
+        """What a search has drawn but what -params says: that wins, as in the zoo; keyword arguments are joined."""
+        told = set(self.custom_hyperparams or ()) - {"dynamics_kwargs"}
+        return {name: value for name, value in drawn.items() if name not in told}
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         """As the zoo's; with two worlds ``n_envs`` is taken to be the source's, callbacks count target steps."""
@@ -229,7 +245,7 @@ class TransferManager(ExperimentManager):
             if self.algo == "sac":
                 hyperparams["learning_starts"] = 0  # a trained agent takes no random steps
             agent: Any = super()._load_pretrained_agent(hyperparams, env)
-            came_from = settings_beside(self.trained_agent, "args.yml").get("env") or _target_beside(self.trained_agent)
+            came_from = settings_beside(self.trained_agent, "args.yml").get("env") or target_beside(self.trained_agent)
             here = came_from is not None and EnvironmentName(str(came_from)) == self.env_name
             if not here and (came_from is not None or agent.replay_buffer.size()):
                 place = came_from or "an environment that nothing beside it tells"
@@ -331,7 +347,7 @@ class TransferManager(ExperimentManager):
         except KeyboardInterrupt:  # what was learned is saved, and resumes
             pass
         finally:
-            _close(model)
+            _close(model.env, model.target_env)
             if self.callbacks and hasattr(self.callbacks[0], "pbar"):  # a progress bar that was begun is the first
                 self.callbacks[0].on_training_end()
 
@@ -345,7 +361,7 @@ class TransferManager(ExperimentManager):
         """
         if self.start is None:
             return super().objective(trial)
-        sampled = SAMPLERS[self.algo](trial, self.n_actions, self._n_source_envs, {})
+        sampled = self._not_told(SAMPLERS[self.algo](trial, self.n_actions, self._n_source_envs, {}))
         merged = {**self._hyperparams, **_applicable(sampled, self._hyperparams)}
         source, target = self.create_envs(1, no_log=True), self.create_target(no_log=True)
         evaluation = self.create_envs(self.n_eval_envs, eval_env=True)
@@ -363,18 +379,35 @@ class TransferManager(ExperimentManager):
         )
         asked = self._asked | sampled.keys()
         verbose = self.verbose if self.verbose >= 2 else 0
-        model = self._begin(self.start, merged, asked, source, target, seed=None, verbose=verbose)
         try:
+            model = self._begin(self.start, merged, asked, source, target, seed=None, verbose=verbose)
             model.learn(self.n_timesteps, callback=[*get_callback_list({"callback": self.specified_callbacks}), judge])
-        except ValueError as error:  # numbers that are not finite any more
+            if judge.is_pruned:
+                raise optuna.exceptions.TrialPruned()
+            # The last step was judged before what follows it: updates, a fit, a trace and the learning after that.
+            if isinstance(evaluation, VecNormalize):
+                sync_envs_normalization(source, evaluation)
+            earned, _ = evaluate_policy(model, evaluation, self.n_eval_episodes, self.deterministic_eval)
+        except ValueError as error:
+            if not (isinstance(error, NotFiniteError) or INVALID in str(error)):
+                raise  # a wrong setting is no matter of what was drawn
             print(f"trial {trial.number} is pruned: {error}")
             raise optuna.exceptions.TrialPruned() from error
         finally:
-            _close(model)
-            evaluation.close()
-        if judge.is_pruned:
-            raise optuna.exceptions.TrialPruned()
-        return float(judge.last_mean_reward)
+            _close(source, target, evaluation)
+        return float(np.mean(earned))
+
+    def hyperparameters_optimization(self) -> None:
+        """As the zoo's.
+
+        :raises ValueError: no trial was completed
+        """
+        try:
+            super().hyperparameters_optimization()
+        except ValueError as error:
+            if "No trials are completed" not in str(error):
+                raise
+            raise ValueError("no trial of the search was completed; each says above why it was pruned") from None
 
 
 def beside(trained_agent: str, kind: str) -> Path | None:
@@ -402,26 +435,8 @@ def _applicable(drawn: dict[str, Any], settings: dict[str, Any]) -> dict[str, An
     return found
 
 
-def settings_beside(trained_agent: str, name: str) -> dict[str, Any]:
-    """What the zoo saved of the run of a zip; nothing where it is not in such a run's folder.
-
-    :param trained_agent: the zip
-    :param name: ``config.yml``, the settings, or ``args.yml``, the command's arguments
-    """
-    found = sorted(Path(trained_agent).parent.glob(f"*/{name}"))
-    return dict(yaml.unsafe_load(found[0].read_text())) if len(found) == 1 else {}  # it holds an OrderedDict's tag
-
-
-def _target_beside(trained_agent: str) -> str | None:
-    """In what ``sb3-rpto train`` or ``transfer`` trained a zip; None where it is not in such a run's folder."""
-    try:
-        return str(json.loads(Path(trained_agent).with_name("config.json").read_text(encoding="utf-8"))["target"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def _close(model: TransferAlgorithm) -> None:
-    for world in (model.env, model.target_env):
+def _close(*worlds: VecEnv | None) -> None:
+    for world in worlds:
         if world is not None:
             with contextlib.suppress(EOFError, OSError):  # processes that Ctrl-C has ended, too
                 world.close()

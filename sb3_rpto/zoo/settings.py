@@ -1,7 +1,8 @@
-"""What the zoo knows of a task by its id: the source of a target, and an algorithm's settings. Needs no rl_zoo3."""
+"""What the zoo knows of a task by its id, an algorithm's settings, and those of a finished run. Needs no rl_zoo3."""
 
 from __future__ import annotations
 
+import json
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -64,3 +65,21 @@ def shipped_settings(algo: str, env_id: str) -> dict[str, Any]:
 def shipped_algorithms() -> list[str]:
     """Names of the algorithms that we ship settings for."""
     return sorted(path.name.removesuffix(".yml") for path in _FOLDER.iterdir() if path.name.endswith(".yml"))
+
+
+def settings_beside(trained_agent: str, name: str) -> dict[str, Any]:
+    """What the zoo saved of the run of a zip; nothing where it is not in such a run's folder.
+
+    :param trained_agent: the zip
+    :param name: ``config.yml``, the settings, or ``args.yml``, the command's arguments
+    """
+    found = sorted(Path(trained_agent).parent.glob(f"*/{name}"))
+    return dict(yaml.unsafe_load(found[0].read_text())) if len(found) == 1 else {}  # it holds an OrderedDict's tag
+
+
+def target_beside(trained_agent: str) -> str | None:
+    """In what ``sb3-rpto train`` or ``transfer`` trained a zip; None where it is not in such a run's folder."""
+    try:
+        return str(json.loads(Path(trained_agent).with_name("config.json").read_text(encoding="utf-8"))["target"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

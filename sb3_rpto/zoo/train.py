@@ -107,6 +107,9 @@ def _start(parser: argparse.ArgumentParser, ours: argparse.Namespace, rest: list
     known.add_argument("--seed", type=int, default=-1)
     known.add_argument("--eval-env-kwargs", nargs="+")
     known.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
+    known.add_argument("--storage")
+    known.add_argument("--study-name")
+    known.add_argument("--trial-id", type=int)
     theirs, _ = known.parse_known_args(rest)
     if theirs.algo not in ALGORITHMS:
         passed = [f"--{name.replace('_', '-')}" for name, value in vars(ours).items() if value is not None]
@@ -135,6 +138,8 @@ def _start(parser: argparse.ArgumentParser, ours: argparse.Namespace, rest: list
         )
     if theirs.optimize_hyperparameters and ours.source_model is None:
         parser.error("-optimize needs --source-model: without it, every trial would first train an agent in the source")
+    if theirs.trial_id is not None and not (theirs.storage and theirs.study_name):
+        parser.error(f"--trial-id {theirs.trial_id} needs the --storage and the --study-name of its search")
     if ours.source_model is not None and theirs.trained_agent:
         parser.error("--source-model begins a run and -i goes on with one; leave one of them out")
     if ours.source_data is not None and ours.source_model is None:

@@ -16,6 +16,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPO, RPTO, RTO
+from sb3_rpto.algorithms import warm
 from sb3_rpto.buffers import chronological
 
 
@@ -366,6 +367,8 @@ def test_bad_input_is_refused_before_learning():
             small(RPO).learn(budget)
     with pytest.raises(ValueError, match="source_timesteps"):
         small(RPO).learn(10, source_timesteps=-1)
+    with pytest.raises(ValueError, match="log_interval is 0"):
+        small(RPO).learn(10, log_interval=0)
     with pytest.raises(ValueError, match="4 environments"):
         small(RPO, target=make_vec_env(pendulum, n_envs=4)).learn(3)
 
@@ -445,6 +448,27 @@ def test_the_budget_of_source_steps_is_not_exceeded():
     assert model.num_timesteps == 100
 
 
+@pytest.mark.parametrize(
+    ("sources", "targets", "train_freq", "budgets"),
+    [
+        (1, 1, 10, [45, 12]),
+        (1, 4, 1, [40]),
+        (8, 1, 1, [20]),
+        (1, 2, 5, [44]),
+        (1, 1, (1, "episode"), [45]),
+    ],
+)
+def test_every_target_step_is_matched_with_so_many_source_steps(sources, targets, train_freq, budgets, monkeypatch):
+    monkeypatch.setattr(warm, "FIRST_SOURCE_STEPS", 0)
+    env = make_vec_env(pendulum, n_envs=sources)
+    target = make_vec_env(lambda: gym.make("Pendulum-v1", g=12.0, max_episode_steps=20), n_envs=targets)
+    model = small(RPO, env, target, train_freq=train_freq, source_steps=4)
+    for budget in budgets:
+        model.learn(budget, source_timesteps=0, reset_num_timesteps=False)
+        assert model.source_timesteps == 4 * model.num_timesteps
+    assert model.num_timesteps == sum(budgets)
+
+
 @pytest.mark.parametrize("change", ["next_obs", "rew", "rew2d"])
 def test_a_log_with_arrays_of_other_shapes_is_refused(change, tmp_path):
     arrays = {name: np.zeros((20, 3), np.float32) for name in ("obs", "next_obs")}
@@ -457,6 +481,15 @@ def test_a_log_with_arrays_of_other_shapes_is_refused(change, tmp_path):
     np.savez(tmp_path / "log.npz", **arrays)
     with pytest.raises(ValueError, match="target_data holds"):
         RTO("MlpPolicy", pendulum(), target_data=tmp_path / "log.npz", dynamics_kwargs=SMALL_ENSEMBLE)
+
+
+@pytest.mark.parametrize(("argument", "data"), [("source_data", b"no zip"), ("target_data", b"")])
+def test_what_holds_no_transitions_is_refused_by_the_arguments_name(argument, data, tmp_path):
+    (tmp_path / "log.npz").write_bytes(data)
+    worlds = {"target_env": pendulum(12.0)} if argument == "source_data" else {}
+    sac = SAC("MlpPolicy", pendulum(), policy_kwargs={"net_arch": [16]}, device="cpu")
+    with pytest.raises(ValueError, match=rf"{argument}: .*log.npz' is no .npz file"):
+        RTO.from_source(sac, pendulum(), dynamics_kwargs=SMALL_ENSEMBLE, **worlds, **{argument: tmp_path / "log.npz"})
 
 
 def test_rewards_that_a_log_lacks_come_from_the_tasks_reward_function(tmp_path):
