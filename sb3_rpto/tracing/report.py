@@ -213,7 +213,10 @@ class Report:
         return self.correlation * np.outer(finite, finite) + np.diag(np.where(known, 0.0, np.inf))
 
     def apply(self, env: gym.Env) -> gym.Env:
-        """A corrected copy of a gymnasium MuJoCo environment, for RPTO, SAC, anything; ``env`` stays as it is."""
+        """A corrected copy of a gymnasium MuJoCo environment, for RPTO, SAC, anything; ``env`` stays as it is.
+
+        Effects come on top of those that it has: one that was corrected already is corrected twice.
+        """
         from sb3_rpto.envs.corrected import apply_effects
 
         return apply_effects(env, self.correction)
