@@ -14,7 +14,7 @@ from sb3_rpto.effects.names import SCALAR_JOINTS, object_names
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.columns import Columns, joint_of
 from sb3_rpto.tracing.episodes import Episode
-from sb3_rpto.tracing.identify import Problem
+from sb3_rpto.tracing.identify import SETTLED, Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.prepare import SetUp
 from sb3_rpto.tracing.search import Found
@@ -107,7 +107,8 @@ def misread(found: Found, set_up: SetUp) -> list[Finding]:
 
     # The declared numbers alone may promise more: what was found makes up for the way of reading.
     begins = (model.fit.values, found.base.fit.values)
-    usual = least_error(problem(lambda episode: episode, range(len(set_up.sigma))), begins, free)
+    as_read = problem(lambda episode: episode, range(len(set_up.sigma)))
+    usual = float(np.median(as_read.score(begins[0], iterations=SETTLED).errors))
     tried = []
     for reading in readings(set_up.nominal, data):
         there = problem(reading.again, reading.order)
@@ -122,16 +123,6 @@ def misread(found: Found, set_up: SetUp) -> list[Finding]:
         return []
     message = f"{best.what} the model errs by {share:.0%} of what it does: {best.remedy} and trace again"
     return [Finding(best.kind, best.where, message)]
-
-
-def least_error(problem: Problem, begins: Sequence[np.ndarray], free: np.ndarray) -> float:
-    """The median error of the fit that something else is compared with, to the same windows and as often begun.
-
-    :param problem: the windows
-    :param begins: parameters to start from
-    :param free: the parameters to fit
-    """
-    return min(float(np.median(problem.fit(values, free, iterations=ITERATIONS).errors)) for values in begins)
 
 
 def _exchanged(count: int, i: int, j: int) -> list[int]:

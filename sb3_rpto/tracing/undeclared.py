@@ -8,7 +8,7 @@ from sb3_rpto.effects import Declared, Scales, Simulation
 from sb3_rpto.effects.library import candidates
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.identify import Problem
-from sb3_rpto.tracing.misread import CLEARLY, FITTED, ITERATIONS, WINDOWS, least_error
+from sb3_rpto.tracing.misread import CLEARLY, FITTED, ITERATIONS, WINDOWS
 from sb3_rpto.tracing.prepare import SetUp
 from sb3_rpto.tracing.search import Found
 from sb3_rpto.tracing.windows import cut
@@ -30,7 +30,9 @@ def undeclared_mass(found: Found, set_up: SetUp) -> list[Finding]:
     windows = cut(simulation.model, data, set_up.sigma, found.on.fine.horizon, WINDOWS)
     begins = (selection.model.fit.values, found.base.fit.values)  # what was found may make up for the mass
     free = found.on.fine.free(selection.model.effects)
-    usual = least_error(Problem(simulation, windows, train.scales), begins, free)
+    as_it_is = Problem(simulation, windows, train.scales)  # fitted to these windows too, as with another mass
+    fits = [as_it_is.fit(values, free, iterations=ITERATIONS) for values in begins]
+    usual = min(float(np.median(fit.errors)) for fit in fits)
     declared = [effect.label for effect in simulation.effects if isinstance(effect, Declared)]
     tried = []
     for mass in candidates(set_up.nominal, declared, {"mass_scale"}):
