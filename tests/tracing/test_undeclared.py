@@ -6,14 +6,14 @@ import re
 from dataclasses import replace
 
 import pytest
-from simulated import PENDULUM, briefly, recorded
+from simulated import PENDULUM, recorded
 
-from sb3_rpto.effects import LIBRARY
 from sb3_rpto.experiments.planting import generate
 from sb3_rpto.tracing import trace
 from sb3_rpto.tracing.prepare import prepare
 from sb3_rpto.tracing.search import Found, Selection
 from sb3_rpto.tracing.undeclared import undeclared_mass
+from sb3_rpto.tracing.wording import VERDICTS, verdict
 
 
 @pytest.mark.parametrize(
@@ -53,8 +53,12 @@ def test_a_mass_that_was_not_declared_is_named_with_its_size() -> None:
 
 
 def test_candidates_that_the_model_has_no_place_for_are_named() -> None:
-    data = recorded([LIBRARY["coulomb_friction"]("hinge", level=0.3)])
-    report = briefly(PENDULUM, data, ["hinge.damping"], ["wind"])
-    assert report.verdict == "unexplained"
-    assert [finding.where for finding in report.findings if finding.kind == "no place"] == ["wind"]
-    assert "no effects were looked for" in str(report)
+    set_up = prepare(PENDULUM, recorded(), ["hinge.damping"], 0, ["wind", "spring", "wind"], 0.35, 1)
+    assert [finding.where for finding in set_up.findings if finding.kind == "no place"] == ["wind"]
+    assert [effect.kind for effect in set_up.fine.effects] == ["declared", "spring"]
+
+
+def test_where_nothing_was_looked_for_the_verdict_does_not_say_it_was() -> None:
+    assert "no effects were looked for" in verdict("unexplained", searched=False)[0]
+    assert verdict("unexplained", searched=True) == VERDICTS["unexplained"]
+    assert verdict("complete", searched=False) == VERDICTS["complete"]
