@@ -141,8 +141,8 @@ class TwoWorlds(PolicySnapshots):
                 self.loop.forget_target()
             self._drop_target_data()
         if self.target_env is not None or self._offline:
-            self._round_open, self._collected, self._source_due = False, 1, 0
-            self._rollout_began_at = self.num_timesteps
+            self._round_open, self._collected, self._rollout_began_at = False, 1, self.num_timesteps
+            self._source_due = 0
             if self._resume_state is not None:
                 # Where that target stood, and a step of it that is not stored.
                 self._resume_state |= {"target": None, "last_obs": None, "unstored_step": None}
@@ -293,9 +293,8 @@ class TwoWorlds(PolicySnapshots):
         self._last_episode_starts = np.ones(n_envs, dtype=bool)
         normaliser = unwrap_vec_normalize(self.target_env)
         self._last_original_obs = None if normaliser is None else np.asarray(normaliser.get_original_obs())
-        check_finite(
-            "target", observation=np.asarray(self._last_obs if normaliser is None else self._last_original_obs)
-        )
+        own = self._last_obs if normaliser is None else self._last_original_obs
+        check_finite("target", observation=np.asarray(own))
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         """As SB3's, with what counts environments counting the target's, not the source's."""
