@@ -46,7 +46,7 @@ class Looping(Resumable):
     def _source_steps_to_take(self) -> int:
         """Those for the target steps of the next rollout; of whole episodes, as many as in the last one.
 
-        Steps that several copies took beyond those wanted, and those of a rollout that was another, are made up for.
+        What several copies took too much, or the last rollout turned out to need more or less, is made up for.
         """
         assert isinstance(self.train_freq, TrainFreq)  # SB3's setup has made it one
         if self._offline:  # the budget is one of source steps then

@@ -407,7 +407,7 @@ class TransferManager(ExperimentManager):
         except ValueError as error:
             if "No trials are completed" not in str(error):
                 raise
-            raise ValueError("no trial of the search was completed; each says above why it was pruned") from None
+            raise ValueError("no trial of the search was completed; those that were pruned say above why") from None
 
 
 def beside(trained_agent: str, kind: str) -> Path | None:
