@@ -159,10 +159,11 @@ class DualReplayBuffer(ReplayBuffer):
         foreign = type(side).add is not ReplayBuffer.add and side.size() > 0
         if capacity == side.buffer_size or foreign:
             return
-        kept = {name: array[-capacity:] for name, array in chronological(side).items()}
+        order = rows_in_order(side)[-capacity:]
+        kept = {name: getattr(side, name)[order, 0] for name in _ARRAYS if hasattr(side, name)}
         setattr(self, world, self._make_side(buffer_size=capacity, device=self.device))
-        if len(kept["rewards"]) > 0:
-            self.append(world, dones=kept.pop("terminations"), **kept)
+        if len(order) > 0:
+            self.append(world, **kept)
         self.target_added, self.buffer_size = added, self.target.buffer_size
 
     def append(
@@ -220,15 +221,18 @@ class DualReplayBuffer(ReplayBuffer):
         return side.sample(batch_size, env=env)
 
 
+def rows_in_order(side: ReplayBuffer) -> np.ndarray:
+    """Where the transitions of a buffer are in its arrays, (n,), oldest first."""
+    return (np.arange(side.size()) + side.pos * side.full) % side.buffer_size
+
+
 def chronological(side: ReplayBuffer) -> dict[str, np.ndarray]:
     """All transitions of one side, oldest first, as arrays.
 
     :return: ``observations`` and ``next_observations`` (n, observation_dim), ``actions`` (n, action_dim) scaled to
         [-1, 1], ``rewards`` (n,), ``terminations`` (n,) without time limits
     """
-    order = np.arange(side.size())
-    if side.full:
-        order = (order + side.pos) % side.buffer_size
+    order = rows_in_order(side)
     rows = {name: getattr(side, name)[order] for name in _ARRAYS if hasattr(side, name)}
     kept = np.ones((len(order), side.n_envs), dtype=bool)
     if side.optimize_memory_usage:

@@ -16,6 +16,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.algorithms.update import as_transitions
+from sb3_rpto.buffers import rows_in_order
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.theory import Estimate, dynamics_gap_estimate, policy_gap_estimate
 
@@ -126,7 +127,7 @@ class RelativityGapCallback(TransferCallback):
                 return None
             q, v = self._old_values(side.observations[np.concatenate(episodes), 0])
             return policy_gap_estimate(_split(q, episodes), _split(v, episodes), gamma)
-        newest = _chronological_rows(side)[-BRANCH_STATES:]
+        newest = rows_in_order(side)[-BRANCH_STATES:]
         if len(newest) < 2:
             return None
         q, v = self._old_values(side.observations[newest, 0])
@@ -223,7 +224,7 @@ def newest_episodes(side: ReplayBuffer, n_envs: int, n_episodes: int) -> list[np
     :param n_episodes: number of episodes wanted
     :return: at most ``n_episodes`` arrays of row indices, oldest episode first
     """
-    rows = _chronological_rows(side)
+    rows = rows_in_order(side)
     rows = rows[len(rows) % n_envs :].reshape(-1, n_envs)
     found: list[tuple[int, np.ndarray]] = []
     for stream in rows.T:
@@ -234,10 +235,6 @@ def newest_episodes(side: ReplayBuffer, n_envs: int, n_episodes: int) -> list[np
         found += islice((item for item in whole if _continuous(side, item[1])), n_episodes)
     found.sort(key=lambda item: item[0])
     return [episode for _, episode in found[-n_episodes:]]
-
-
-def _chronological_rows(side: ReplayBuffer) -> np.ndarray:
-    return (np.arange(side.size()) + side.pos * side.full) % side.buffer_size
 
 
 def _continuous(side: ReplayBuffer, rows: np.ndarray) -> bool:

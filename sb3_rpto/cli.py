@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
-import os
 import sys
 import tempfile
 import warnings
@@ -202,8 +201,6 @@ def _model(name: str) -> Any:
 
     from sb3_rpto.commands import options
 
-    if os.getcwd() not in sys.path:  # as `python -m` would: modules of one's own environments lie there
-        sys.path.append(os.getcwd())
     with contextlib.suppress(ValueError):  # a task's name, or a shift that is not registered
         return options.world(name, "MODEL").make()
     try:

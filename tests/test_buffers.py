@@ -236,3 +236,14 @@ def test_transitions_of_a_buffer_that_saves_memory_are_those_that_it_still_knows
     known = (expected["observations"][:, 0] % 4 != 3) & (np.arange(len(expected["rewards"])) >= (steps > 10))
     for name in expected:
         np.testing.assert_array_equal(found[name], expected[name][known], err_msg=name)
+
+
+def test_another_capacity_keeps_what_ended_by_a_time_limit():
+    buffer = DualReplayBuffer(15, OBS, ACT, device="cpu")
+    for start in (0, 10):
+        buffer.append("source", **rows(start, 10))
+    buffer.resize("source", 12)
+    kept, side = rows(8, 12), buffer.source
+    for name in ("rewards", "dones", "timeouts"):
+        np.testing.assert_array_equal(getattr(side, name)[:, 0], kept[name])
+    assert kept["timeouts"].any()

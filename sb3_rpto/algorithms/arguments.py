@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
@@ -49,6 +49,22 @@ ONLINE = frozenset({"action_noise", "train_freq"})
 FEW_UPDATES = 1_000
 #: Goals, Dict observations and n-step returns (SB3's HerReplayBuffer is a DictReplayBuffer).
 UNSUPPORTED_BUFFERS = (DictReplayBuffer, NStepReplayBuffer)
+
+
+def set_among(function: Callable[..., Any], received: Mapping[str, Any]) -> frozenset[str]:
+    """Names of the arguments that were received with another value than the function's default.
+
+    :param function: whose they are
+    :param received: values by name, others among them
+    """
+
+    def is_default(value: Any, default: Any) -> bool:
+        return value is default or (type(value) is type(default) and isinstance(value, str | Real) and value == default)
+
+    known = inspect.signature(function).parameters
+    return frozenset(
+        name for name, value in received.items() if name in known and not is_default(value, known[name].default)
+    )
 
 
 def check_supported(n_steps: int, optimize_memory_usage: bool, replay_buffer_class: type[ReplayBuffer] | None) -> None:
@@ -346,12 +362,12 @@ def _warn_of_little(model: TwoWorlds, total_timesteps: int) -> None:
     if model._offline:
         steps = model._steps_of_round()
         rounds = -(-total_timesteps // steps)
-        updates = rounds * max(model.gradient_steps, 1)
-        if not model._n_updates and updates < FEW_UPDATES <= total_timesteps:  # one that goes on was told
+        updates = rounds * model.updates_per_step
+        if not model._n_updates and 0 < updates < FEW_UPDATES <= total_timesteps:  # one that goes on was told
             warnings.warn(
                 f"total_timesteps={total_timesteps} source steps are {rounds} rounds of {steps} (source_steps="
-                f"{model.source_steps}) with gradient_steps={model.gradient_steps} updates each, {updates} in all; "
-                "raise gradient_steps or total_timesteps",
+                f"{model.source_steps}) with {model.updates_per_step} updates each by gradient_steps="
+                f"{model.gradient_steps}, {updates} in all; raise gradient_steps or total_timesteps",
                 stacklevel=4,
             )
     elif model.loop is not None and _first_trace(model, model.loop) > total_timesteps:

@@ -147,12 +147,14 @@ class TwoWorlds(PolicySnapshots):
                 # Where that target stood, and a step of it that is not stored.
                 self._resume_state |= {"target": None, "last_obs": None, "unstored_step": None}
         self._bind_rules(venv, of_target=True)
+        self._has_target_rules = False  # but of the last one
         self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
         self._offline = self._traces_log = False
         self._judged_target = self._judged_rules = False
-        self._last_obs = None
-        if self.seed is not None:
-            self.target_env.seed(self.seed + TARGET_SEED_OFFSET)
+        self._last_obs = self._null_check = None
+        seed = self.seed if self._new_seed is None else self._new_seed
+        if seed is not None:
+            self.target_env.seed(seed + TARGET_SEED_OFFSET)
 
     def _drop_target_data(self) -> None:
         """D_target without what another target told."""
@@ -187,7 +189,7 @@ class TwoWorlds(PolicySnapshots):
         Rules that the user passed stay, and so does a rule that the target does not tell.
         """
         config = self.dynamics_config
-        if config is None or "termination_fn" not in config or self.target_env is None:
+        if self._has_target_rules or config is None or "termination_fn" not in config or self.target_env is None:
             return
         rules = task_rules(find_ledger(self.target_env).venv)
         for name in ("reward_fn", "termination_fn"):
@@ -290,7 +292,6 @@ class TwoWorlds(PolicySnapshots):
             self.action_noise = single if n_envs == 1 else VectorizedActionNoise(single, n_envs)
         self._last_obs = np.asarray(self.target_env.reset())
         find_ledger(self.target_env).begin()
-        self._last_episode_starts = np.ones(n_envs, dtype=bool)
         normaliser = unwrap_vec_normalize(self.target_env)
         self._last_original_obs = None if normaliser is None else np.asarray(normaliser.get_original_obs())
         own = self._last_obs if normaliser is None else self._last_original_obs
@@ -306,8 +307,8 @@ class TwoWorlds(PolicySnapshots):
         return callbacks
 
     def _watch_for_null_shift(self) -> None:
-        """Before the first target step: begin to compare the target with a copy of the source."""
-        if self.num_timesteps == 0 and not self._offline:
+        """Before the first step in a target: begin to compare it with a copy of the source."""
+        if self.replay_buffer.target_added == 0 and not self._offline:
             assert self.env is not None
             assert self.target_env is not None  # learn() has checked
             self._null_check = NullShiftCheck(self.env, find_ledger(self.target_env).venv)

@@ -207,7 +207,8 @@ class LoopCloser:
             model.snapshots.pop("learner", None)  # of the simulator that is dropped
             renew_source(model)
             self.rounds = Rounds()
-        if model.updates_policy and not model._offline and model.updates_per_step:
+        learns = model.updates_policy and not model._offline and model.updates_per_step
+        if learns and self._traced_at is not None:  # else what was corrected for is a target that was left
             judges = self.may_judge(model)
             self.rehearsals.take_up_learner(model)
             try:

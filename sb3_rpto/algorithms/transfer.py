@@ -139,6 +139,7 @@ class TransferAlgorithm(Looping):
         source_steps: int | Literal["auto"] = "auto",
         model_train_freq: int = 250,
     ) -> None:
+        self._passed |= arguments.set_among(TransferAlgorithm.__init__, locals())  # by a subclass's __init__, too
         arguments.check_learning_rate(learning_rate)
         if isinstance(env, str):
             env = gym.make(env)

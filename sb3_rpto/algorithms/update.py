@@ -59,12 +59,13 @@ class RelativeUpdate(SAC):
     _pretraining: bool
     #: step 3 of a round is done, its steps 5 and 6 are not
     _round_open: bool
-    #: target steps taken in the last rollout (with recorded target data: calls of the source), those since the last
-    #: fit, and actor updates so far
+    #: target steps taken in the last rollout (with recorded target data: calls of the source)
     _collected: int
-    #: source steps that these are still to be matched with in step 3; negative: taken in advance
+    #: source steps that target steps are still to be matched with in step 3; negative: taken in advance
     _source_due: int
+    #: target steps since the last fit
     _since_fit: int
+    #: so far
     _actor_updates: int
     #: recorded data stand in for the target
     _offline: bool

@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_rpto.commands.runs import CURVE, RunFolder, class_name
 from sb3_rpto.commands.terminal import say
+from sb3_rpto.files import write_text
 
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.closing import LoopCloser
@@ -75,7 +76,7 @@ class Progress(BaseCallback):
         self.model.save(folder / "model.zip")
         self.model.save_replay_buffer(folder / "replay_buffer.pkl")  # type: ignore[attr-defined]
         state = {"class": class_name(self.model), "rows": self.rows}
-        (folder / CURVE).write_text(json.dumps(state), encoding="utf-8")
+        write_text(folder / CURVE, json.dumps(state))
 
 
 def read_rows(checkpoint: Path) -> list[dict[str, Any]]:

@@ -19,7 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.commands.terminal import lines
 from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
-from sb3_rpto.files import plain, write_json
+from sb3_rpto.files import plain, write_json, write_text
 
 if TYPE_CHECKING:
     from sb3_rpto.tracing import Report
@@ -294,7 +294,7 @@ class SavedCurve(LearningCurve):
             self.model.save(folder / "model.zip")
             if getattr(self.model, "replay_buffer", None) is not None:
                 self.model.save_replay_buffer(folder / "replay_buffer.pkl")  # type: ignore[attr-defined]
-            (folder / CURVE).write_text(json.dumps(state), encoding="utf-8")
+            write_text(folder / CURVE, json.dumps(state))
 
         self.run.save_checkpoint(self.num_timesteps, write)
 

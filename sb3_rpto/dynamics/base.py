@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import defaultdict, deque
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -128,19 +129,24 @@ class Dynamics(nn.Module, ABC):
         self.generator.set_state(state["generator"].cpu())
 
 
-def predecessors(observations: np.ndarray, next_observations: np.ndarray) -> np.ndarray:
+def predecessors(observations: np.ndarray, next_observations: np.ndarray, dones: np.ndarray) -> np.ndarray:
     """The row that each transition goes on from, (n,); -1 where an episode begins.
 
-    Rows of several environments may be interleaved, as a target of several stores them.
+    Rows of several environments may be interleaved, as a target of several stores them: of some that ended where one
+    begins it goes on from the oldest.
 
     :param observations: oldest first, (n, d)
     :param next_observations: (n, d)
+    :param dones: (n,), after these nothing follows
     """
-    found, ends = np.full(len(observations), -1), dict[bytes, int]()
+    found, ends = np.full(len(observations), -1), defaultdict[bytes, deque[int]](deque)
     # Adding zero makes one zero of two.
-    for row, (begin, end) in enumerate(zip(observations + 0.0, next_observations + 0.0)):
-        found[row] = ends.pop(begin.tobytes(), -1)
-        ends[end.tobytes()] = row
+    for row, (begin, end, done) in enumerate(zip(observations + 0.0, next_observations + 0.0, dones)):
+        waiting = ends[begin.tobytes()]
+        if waiting:
+            found[row] = waiting.popleft()
+        if not done:
+            ends[end.tobytes()].append(row)
     return found
 
 

@@ -160,7 +160,8 @@ class DeterministicDynamics(EnsembleDynamics):
 
     def _successors(self, data: Transitions) -> th.Tensor:
         """The row that goes on from each, (n,); -1 where there is none."""
-        before = predecessors(data.observations.cpu().numpy(), data.next_observations.cpu().numpy())
+        arrays = (data.observations, data.next_observations, data.terminations)
+        before = predecessors(*(array.cpu().numpy() for array in arrays))
         after = np.full(len(before), -1)
         after[before[before >= 0]] = np.flatnonzero(before >= 0)
         return th.as_tensor(after, device=self.device)

@@ -112,7 +112,7 @@ def as_steps(
     kept = np.flatnonzero(known[:, ever].all(axis=1))
     rows = chosen[kept]
     commands = np.clip(actions, *command_limits(model))
-    before = predecessors(observations, next_observations)
+    before = predecessors(observations, next_observations, data.terminations.cpu().numpy())
     drive = np.repeat(_history(commands, before, rows, earlier, idle), frame_skip, axis=1)
     begun, reached = (np.nan_to_num(np.concatenate([s.qpos, s.qvel], axis=1))[kept] for s in (now, then))
     turned = list(now.wrapped)

@@ -11,7 +11,7 @@ from sb3_rpto.tracing.adequacy import SETTLED, TOLERANCE, adequacy, judge
 from sb3_rpto.tracing.cautions import DRY, WORSE, creeping
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.origin import may_be_exact, origin
+from sb3_rpto.tracing.origin import may_be_exact, met_exactly, origin
 from sb3_rpto.tracing.prepare import Progress, SetUp
 from sb3_rpto.tracing.search import Found
 from sb3_rpto.tracing.select import Selection
@@ -114,7 +114,7 @@ def conclude(
         simulated = True
         set_up, found = read(data, simulated)
         set_up.findings.append(again)
-    if not _explains(found) and may_be_exact(data):
+    if may_be_exact(data) and (not _explains(found) or _is_exact(set_up, found, declared, threads)):
         exact, then = read(replace(data, exact=True), simulated)
         if _explains(then):
             set_up, found = exact, then
@@ -171,6 +171,20 @@ def _softer(kinds: Sequence[str] | None) -> list[str]:
     return [*others, "soft_friction"] if len(others) < len(kinds) else []
 
 
+def _is_exact(set_up: SetUp, found: Found, declared: Sequence[str], threads: int) -> bool:
+    """Whether recordings without noise were taken for noisy ones, which wrong numbers may explain, too."""
+    return met_exactly(set_up.nominal, set_up.fitted, declared, set_up.length, threads, _known_and_found(found))
+
+
+def _known_and_found(found: Found) -> list[Effect]:
+    """The effects that are no candidates any more, as they were fitted."""
+    simulation, values = found.on.fine.simulation, found.selection.model.fit.values
+    known = [i for i, e in enumerate(simulation.effects) if e.known and not isinstance(e, Declared)]
+    kept = (*known, *found.selection.model.effects)
+    there = [simulation.effects[i].with_values(values[simulation.slices[i]]) for i in kept]
+    return [effect for effect in there if not effect.does_nothing]  # as known ones may, after the fit
+
+
 def _of_own_steps(set_up: SetUp, found: Found, declared: Sequence[str], threads: int) -> Finding | None:
     """Whether recordings that were taken for a machine's turn out to be the model's own, now that something is found.
 
@@ -178,12 +192,9 @@ def _of_own_steps(set_up: SetUp, found: Found, declared: Sequence[str], threads:
     """
     if _explains(found) or not found.selection.model.effects:
         return None
-    simulation, values = found.on.fine.simulation, found.selection.model.fit.values
-    known = [i for i, e in enumerate(simulation.effects) if e.known and not isinstance(e, Declared)]
-    kept = (*known, *found.selection.model.effects)
-    there = [simulation.effects[i].with_values(values[simulation.slices[i]]) for i in kept]
-    there = [effect for effect in there if not effect.does_nothing]  # as known ones may, after the fit
-    kind = origin(set_up.nominal, set_up.fitted, declared, set_up.sigma, set_up.length, threads, there)
+    kind = origin(
+        set_up.nominal, set_up.fitted, declared, set_up.sigma, set_up.length, threads, _known_and_found(found)
+    )
     if kind == "machine":
         return None
     message = "from the model's own steps in time, as shows with what was found first; searched again in such steps"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal, TypeAlias
 
 import mujoco
@@ -107,21 +108,46 @@ def origin(
     if data.exact or len(steps) == 1:
         return "machine"
 
-    def error(kind: Measurements, noise: np.ndarray) -> float:
-        stepped = discretised(model, kind, fine=True)
-        there = given(stepped, declared, known)
-        simulation = Simulation(stepped, there, threads)
-        scales = typical(simulation, force_residuals(simulation, simulation.null, kind)).scales(simulation.effects)
-        problem = Problem(simulation, cut(stepped, kind, noise, horizon, WINDOWS), scales)
-        fit = problem.fit(simulation.null, np.flatnonzero(simulation.strength), iterations=ITERATIONS)
-        return float(np.median(fit.errors))
-
-    continuous = error(data, sigma)
+    fit = partial(_error, model, declared=declared, horizon=horizon, threads=threads, known=known)
+    continuous = fit(data, sigma)
     if continuous < ENOUGH:
         return "machine"
-    own = error(replace(data, simulated=True), sigma)
+    own = fit(replace(data, simulated=True), sigma)
     if own > (SOMEWHAT if own < ENOUGH else CLEARLY) * continuous:
         return "machine"
+    noiseless = bool(np.all(sigma < NOISELESS * noise_levels(replace(data, exact=True, noise=None))))
+    return "exact" if noiseless and met_exactly(model, data, declared, horizon, threads, known) else "simulated"
+
+
+def met_exactly(
+    model: mujoco.MjModel,
+    data: Measurements,
+    declared: Sequence[str],
+    horizon: float,
+    threads: int,
+    known: Sequence[Effect] = (),
+) -> bool:
+    """Whether the model's own steps lead from the states of recordings to those after them, but for rounding.
+
+    Parameters as of :func:`origin`.
+    """
     exact = replace(data, exact=True, noise=None)
-    level = noise_levels(exact)
-    return "exact" if np.all(sigma < NOISELESS * level) and error(exact, level) < ENOUGH else "simulated"
+    return _error(model, exact, noise_levels(exact), declared, horizon, threads, known) < ENOUGH
+
+
+def _error(
+    model: mujoco.MjModel,
+    data: Measurements,
+    noise: np.ndarray,
+    declared: Sequence[str],
+    horizon: float,
+    threads: int,
+    known: Sequence[Effect],
+) -> float:
+    """Typical error of some windows, in units of the noise, where the declared parameters and ``known`` are fitted."""
+    stepped = discretised(model, data, fine=True)
+    simulation = Simulation(stepped, given(stepped, declared, known), threads)
+    scales = typical(simulation, force_residuals(simulation, simulation.null, data)).scales(simulation.effects)
+    problem = Problem(simulation, cut(stepped, data, noise, horizon, WINDOWS), scales)
+    fit = problem.fit(simulation.null, np.flatnonzero(simulation.strength), iterations=ITERATIONS)
+    return float(np.median(fit.errors))

@@ -13,7 +13,8 @@ import numpy as np
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_rpto.buffers import DualReplayBuffer
+from sb3_rpto.buffers import DualReplayBuffer, rows_in_order
+from sb3_rpto.dynamics.base import predecessors
 from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.envs.observations import (
     StateMap,
@@ -110,9 +111,7 @@ def from_minari(dataset: Any, env: gym.Env | VecEnv | None = None) -> Measuremen
 
 def _transitions(side: ReplayBuffer, column: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Observations, next observations, actions and dones (time limits too) of one environment, oldest first."""
-    order = np.arange(side.size())
-    if side.full:
-        order = (order + side.pos) % side.buffer_size
+    order = rows_in_order(side)
     if not side.optimize_memory_usage:
         arrays = side.observations, side.next_observations, side.actions, side.dones
         o, n, a, d = (array[order, column] for array in arrays)
@@ -136,20 +135,18 @@ def chain(observations: np.ndarray, next_observations: np.ndarray, dones: np.nda
     :param dones: (n,), after these nothing follows
     :return: the row numbers of each episode, and how many episodes break off without an end before the last rows
     """
+    before = predecessors(observations, next_observations, dones)
     chains: list[list[int]] = []
-    open_ends: defaultdict[bytes, list[int]] = defaultdict(list)
-    for row, done in enumerate(dones):
-        waiting = open_ends[observations[row].tobytes()]
-        index = waiting.pop(0) if waiting else len(chains)
-        if index == len(chains):
+    belongs = np.full(len(dones), -1)  # to which of them
+    for row, last in enumerate(before):
+        if last < 0:
             chains.append([])
-        chains[index].append(row)
-        if not done:
-            open_ends[next_observations[row].tobytes()].append(index)
-    steps = np.concatenate([np.diff(rows) for rows in chains]).astype(int)
+        belongs[row] = belongs[last] if last >= 0 else len(chains) - 1
+        chains[belongs[row]].append(row)
+    steps = (np.arange(len(dones)) - before)[before >= 0]
     interleaved = int(np.bincount(steps).argmax()) if len(steps) else 1
-    ends = [chains[i][-1] for waiting in open_ends.values() for i in waiting]
-    return [np.array(rows) for rows in chains], sum(end + interleaved < len(dones) for end in ends)
+    broken = sum(not dones[rows[-1]] and rows[-1] + interleaved < len(dones) for rows in chains)
+    return [np.array(rows) for rows in chains], broken
 
 
 def build(

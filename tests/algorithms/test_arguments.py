@@ -1,5 +1,7 @@
 """What is refused before anything is built, each check by itself."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -295,6 +297,17 @@ def test_a_subclass_may_take_arguments_of_its_own():
         small(Mine, pendulum(), pendulum(12.0), color="blue")
 
 
+def test_what_a_subclass_sets_wins_over_the_preset():
+    class Mine(RPTO):
+        def __init__(self, env, gradient_steps=7, **kwargs):
+            super().__init__("MlpPolicy", env, 3e-4, 2_000, gradient_steps=gradient_steps, source_steps=10, **kwargs)
+
+    plain, mine = RPTO("MlpPolicy", pendulum(), dynamics_kwargs={"hidden": [4]}), Mine(pendulum())
+    names = ("buffer_size", "gradient_steps", "source_steps", "model_train_freq")
+    assert [getattr(mine, name) for name in names] == [2_000, 7, 10, plain.model_train_freq]
+    assert plain.gradient_steps != 7
+
+
 def test_a_source_model_that_is_not_there_is_named():
     with pytest.raises(FileNotFoundError, match=r"source_model='nowhere\.zip': there is no such file"):
         RPO.from_source("nowhere.zip", pendulum())
@@ -303,8 +316,15 @@ def test_a_source_model_that_is_not_there_is_named():
 def test_next_to_no_updates_offline_are_told():
     model = small(RPTO, source_steps=400, gradient_steps=5)
     model._offline = True
-    told = r"3 rounds of 400 \(source_steps=400\) with gradient_steps=5 updates each, 15 in all"
+    told = r"3 rounds of 400 \(source_steps=400\) with 5 updates each by gradient_steps=5, 15 in all"
     with pytest.warns(UserWarning, match=told):
+        arguments._warn_of_little(model, 1_200)
+    model.gradient_steps = -1
+    with pytest.warns(UserWarning, match="with 1 updates each by gradient_steps=-1, 3 in all"):
+        arguments._warn_of_little(model, 1_200)
+    model.gradient_steps = 0  # nobody asked for any
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         arguments._warn_of_little(model, 1_200)
 
 

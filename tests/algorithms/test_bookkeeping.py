@@ -105,6 +105,25 @@ def test_the_null_shift_check_ends():
     assert model._null_check is None
 
 
+def test_a_target_in_the_place_of_another_one_is_checked_anew():
+    model = small(RPO, short(10.0), short(12.0))
+    model.learn(3, source_timesteps=0)
+    with pytest.warns(UserWarning, match="D_target loses"):
+        model.set_target_env(short(10.0))
+    with pytest.warns(UserWarning, match="stepped exactly like env"):
+        model.learn(20, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("seed", [None, 0])
+def test_a_target_is_seeded_as_the_seed_given_last_says(seed):
+    first, second = small(RPO, short(10.0), seed=seed), small(RPO, short(10.0), short(12.0), seed=seed)
+    for model in (first, second):
+        model.set_random_seed(7)
+    first.set_target_env(short(12.0))
+    seen = [model.target_env.reset() for model in (first, second)]
+    np.testing.assert_array_equal(*seen)
+
+
 @pytest.mark.parametrize("widths", [(2, 1), (1, 2), (2, 3)])
 def test_action_noise_takes_the_width_of_the_target(widths):
     first, second = ([short] * width for width in widths)

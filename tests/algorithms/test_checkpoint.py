@@ -21,7 +21,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms import checkpoint, warm
+from sb3_rpto.algorithms import bookkeeping, checkpoint, warm
 from sb3_rpto.algorithms.mbpo import MBPO
 from sb3_rpto.algorithms.pdml import PDML
 from sb3_rpto.algorithms.ptp import PTP
@@ -33,6 +33,7 @@ from sb3_rpto.dynamics.ensemble import EnsembleDynamics
 from sb3_rpto.effects import declare
 from sb3_rpto.effects.model import numbers
 from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.envs.rules import task_rules
 
 
 def assert_same(a, b):
@@ -939,6 +940,20 @@ def test_rules_of_environments_that_do_not_pickle_are_read_again_after_loading(t
             RPTO.load(tmp_path / name).dynamics.reward_fn(*rows)
         loaded = RPTO.load(tmp_path / name, env=source, target_env=target)
         assert (loaded.dynamics.reward_fn(*rows) == expected).all()
+
+
+def test_rules_are_read_once_of_each_target(monkeypatch):
+    read: list[object] = []
+    monkeypatch.setattr(bookkeeping, "task_rules", lambda env: read.append(env) or task_rules(env))
+    model = small(RPTO, WithDriver(pendulum()), WithDriver(pendulum(12.0), 2.0), model_train_freq=10)
+    read.clear()
+    model.learn(30, source_timesteps=0)
+    assert len(read) == 1
+    with pytest.warns(UserWarning, match="D_target loses"):
+        model.set_target_env(WithDriver(pendulum(11.0), 3.0))
+    model.learn(30, reset_num_timesteps=False)
+    rows = th.ones(4, 3), th.ones(4, 1), th.ones(4, 3)
+    assert (model.dynamics.reward_fn(*rows) == -9.0).all()
 
 
 def test_a_mujoco_simulator_is_saved_as_text_and_comes_back_to_the_last_bit(tmp_path):

@@ -313,11 +313,19 @@ def test_phi_stays_what_a_trace_found_where_sensors_are_noisy() -> None:
     np.testing.assert_array_equal(dynamics(made).values, traced)
 
 
-def test_of_another_target_nothing_is_kept() -> None:
+def test_of_another_target_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     loop = LoopCloser(())
-    loop.keeps_phi = True
+    loop.keeps_phi = loop.stale = True
+    loop._traced_at = 100
     loop.forget_target()
     assert not loop.keeps_phi
+    renewed: list[object] = []
+    monkeypatch.setattr(closing, "renew_source", renewed.append)
+    monkeypatch.setattr(Rounds, "learn", lambda *_: pytest.fail("it would learn for the target that was left"))
+    made: Any = SimpleNamespace(updates_policy=True, _offline=False, updates_per_step=1, snapshots={})
+    loop.renew(made)
+    assert renewed == [made]
+    assert not loop.stale
 
 
 @pytest.mark.slow

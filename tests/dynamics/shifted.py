@@ -53,7 +53,8 @@ def noisy(data, level, seed=0):
 
 def observed(data, level, seed=0):
     """The same as sensors with noise show it: what ends a transition begins the next."""
-    rng, before = np.random.default_rng(seed), predecessors(data.observations.numpy(), data.next_observations.numpy())
+    rng = np.random.default_rng(seed)
+    before = predecessors(data.observations.numpy(), data.next_observations.numpy(), data.terminations.numpy())
     begins, ends = (level * rng.standard_normal(data.observations.shape) for _ in range(2))
     begins[before >= 0] = ends[before[before >= 0]]
     return replace(
