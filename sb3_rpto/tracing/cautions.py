@@ -31,6 +31,8 @@ APART = 3.0
 #: A declared number whose interval is wider than this share of itself and of its nominal value is not determined: it
 #: spans an order of magnitude. (Where both are next to nothing: of what is plausible.)
 VAGUE = 0.9
+#: What passes for noise is not all noise where R, at the upper end of its interval, is below this.
+LOOSE = 0.9
 #: Share by which test runs must be predicted worse to be told.
 WORSE = 0.05
 #: Most windows that steps in time are compared in.
@@ -105,6 +107,22 @@ def above_noise(after: list[HorizonError], floor: list[HorizonError], ratio: flo
         "windows cannot rule out that something small is missing, or that what is named stands in for it; record more"
     )
     return [Finding("few windows", "test runs", message)]
+
+
+def vague_noise(after: Adequacy, data: Measurements) -> list[Finding]:
+    """Whether what passes for noise is mostly something else, so that an adequate model may lack what it hides.
+
+    :param after: of the final model
+    :param data: to fit to
+    """
+    if data.whole_states or after.high >= LOOSE:
+        return []
+    message = (
+        f"predictions err by far less than the sensors' noise as it was estimated ({after}): motion between samples "
+        "passes for noise, as after commands that change every few of them, and what is missing may hide below it; "
+        "sample faster, or hold commands for more samples"
+    )
+    return [Finding("vague noise", "fitted runs", message)]
 
 
 def strays(selector: Selector, values: np.ndarray, set_up: SetUp, after: Adequacy, seed: int) -> list[Finding]:

@@ -30,6 +30,7 @@ from sb3_rpto.tracing.cautions import (
     too_short,
     undetermined,
     unstable,
+    vague_noise,
 )
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.conclude import Searched, conclude
@@ -144,6 +145,7 @@ def trace(
         *_of_the_search(searched),
         *too_short(errors_after, data),
         *_of_the_verdict(searched, problem, final, (errors_before, errors_after, floor), seed),
+        *vague_noise(found.after, fitted),
         *undetermined(problem, final, intervals),
         *at_bounds(problem, final, selection.model.effects),
         *strays(selector, final, set_up, found.after, seed),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import Any
 
 import mujoco
@@ -27,6 +28,11 @@ REVERSALS = 16
 WAITED = 0.25
 #: Exact data (from a simulator) count as noisy by this share of a position's standard deviation.
 EXACT = 1e-4
+#: Orders of the differences that tell the noise of measured positions.
+ORDERS = range(3, 8)
+#: Samples between changes of commands tell it where there are so many differences of them, and they are less than this
+#: share of all: fewer, or others, tell less than they gain.
+ENOUGH_HELD, CLEARLY_LESS = 200, 0.85
 #: Least length of a block of windows in s; blocks count as independent.
 BLOCK = 1.0
 #: Some hundred transitions of a simulator are soon over, and no sensor's drift ties them: so many blocks, if shorter.
@@ -94,8 +100,8 @@ class Windows:
 def noise_levels(data: Measurements) -> np.ndarray:
     """Standard deviation of the measurement noise of each position column, (m,).
 
-    Divided differences of order k, scaled to unit variance for white noise, vanish on polynomials of degree k - 1 on
-    any clock. The lowest order from 3 on is used whose successor finds no less: then no motion is left in it.
+    Where a command changes, an acceleration does, which passes for noise: where stretches between the changes of
+    commands tell of clearly less, and are enough to tell, that is the noise.
     """
     levels = []
     for i in range(len(data.columns.qpos)):
@@ -104,31 +110,51 @@ def noise_levels(data: Measurements) -> np.ndarray:
             known = 0.0 if data.noise is None else float(data.noise.qpos[i])
             levels.append(max(known, EXACT * max(float(spread), 1e-3)))
             continue
-        at = [_difference_noise(data.episodes, i, order) for order in range(3, 8)]
-        order = next((k for k in range(4) if at[k + 1] > 0.93 * at[k]), 4)
+        level, between = (_difference_noise(data.episodes, i, held) for held in (False, True))
+        level = between if 0 < between < CLEARLY_LESS * level else level
         steps = [step for e in data.episodes if (step := checks.rounding(e.qpos[:, i])) is not None]
         # A smooth signal without noise still has the rounding of its file.
-        levels.append(max(at[order], float(np.median(steps or [0.0])) / math.sqrt(12), 1e-7))
+        levels.append(max(level, float(np.median(steps or [0.0])) / math.sqrt(12), 1e-7))
     return np.array(levels)
 
 
-def _difference_noise(episodes: Sequence[Episode], column: int, order: int) -> float:
-    found = []
-    for e in episodes:
-        if len(e) <= order:
-            continue
-        t = np.lib.stride_tricks.sliding_window_view(e.time, order + 1)
-        q = np.lib.stride_tricks.sliding_window_view(e.qpos[:, column], order + 1)
-        gaps = t[:, :, None] - t[:, None, :]
-        gaps = gaps / np.abs(gaps).max(axis=(1, 2), keepdims=True)
-        weights = 1 / np.prod(np.where(np.eye(order + 1, dtype=bool), 1.0, gaps), axis=2)
-        found.append((weights * q).sum(1) / np.sqrt((weights**2).sum(1)))
-    if not found:
+def _difference_noise(episodes: Sequence[Episode], column: int, held: bool) -> float:
+    """Noise by divided differences, which vanish on polynomials of a degree below their order on any clock.
+
+    They are scaled to unit variance for white noise. The lowest order from 3 on is used whose successor finds no less:
+    then no motion is left in it.
+
+    :param held: of samples between which no command changes alone; 0 where they are too few
+    """
+    levels: list[float] = []
+    for order in ORDERS:
+        found = np.concatenate([_differences(e, column, order, held) for e in episodes])
+        if held and len(found) < ENOUGH_HELD:
+            break
+        # The smallest 95 % leave out the peaks of motion; what they lack of a Gaussian's variance is known. A median
+        # would know but a few values of a rounded signal.
+        squares = np.sort(found**2)[: max(1, round(0.95 * len(found)))]
+        levels.append(float(np.sqrt(squares.mean() / 0.7588)) if len(found) else 0.0)
+    if not levels:
         return 0.0
-    # The smallest 95 % leave out the peaks of motion; what they lack of a Gaussian's variance is known. A median would
-    # know but a few values of a rounded signal.
-    squares = np.sort(np.concatenate(found) ** 2)
-    return float(np.sqrt(squares[: max(1, round(0.95 * len(squares)))].mean() / 0.7588))
+    return next((now for now, then in pairwise(levels) if then > 0.93 * now), levels[-1])
+
+
+def _differences(episode: Episode, column: int, order: int, held: bool) -> np.ndarray:
+    """Divided differences of a position, (n,), each of ``order`` + 1 samples."""
+    if len(episode) <= order:
+        return np.zeros(0)
+    t = np.lib.stride_tricks.sliding_window_view(episode.time, order + 1)
+    q = np.lib.stride_tricks.sliding_window_view(episode.qpos[:, column], order + 1)
+    gaps = t[:, :, None] - t[:, None, :]
+    gaps = gaps / np.abs(gaps).max(axis=(1, 2), keepdims=True)
+    weights = 1 / np.prod(np.where(np.eye(order + 1, dtype=bool), 1.0, gaps), axis=2)
+    found = (weights * q).sum(1) / np.sqrt((weights**2).sum(1))
+    if not held:
+        return found
+    changes = np.any(np.diff(episode.ctrl, axis=0) != 0, axis=1)  # a command acts from its sample on
+    inside = np.lib.stride_tricks.sliding_window_view(changes[:-1], order - 1)
+    return found[~inside.any(axis=1)]
 
 
 def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco.MjModel:
