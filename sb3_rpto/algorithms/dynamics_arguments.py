@@ -7,12 +7,15 @@ from typing import Any
 
 import cloudpickle
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.factory import is_mujoco
 from sb3_rpto.effects import LIBRARY, from_json
 from sb3_rpto.effects.library import given
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.names import near
+from sb3_rpto.envs.corrected import check_carries
+from sb3_rpto.envs.observations import single_env
 from sb3_rpto.envs.rules import misfit
 
 
@@ -73,6 +76,24 @@ def check_backend(
             f"dynamics='residual' answers each step from its observation alone, where {', '.join(late)} would be lost; "
             "pass dynamics='physical', which simulates whole episodes"
         )
+
+
+def check_carried(env: VecEnv, close_loop: bool | Sequence[str]) -> None:
+    """Refuse a source in which nothing that a trace may find could act: the target steps would be spent by then.
+
+    :param env: the source, a MuJoCo environment
+    :param close_loop: whether, or the kinds of effects to look for
+    :raises ValueError: with the remedy
+    """
+    if close_loop is False:
+        return
+    kinds = [kind for kind, effect in LIBRARY.items() if effect.offered] if close_loop is True else close_loop
+    try:
+        check_carries(single_env(env), kinds)
+    except ValueError as error:
+        raise ValueError(
+            f"close_loop={close_loop}: {error}; or pass close_loop=[...] with kinds that are numbers of the model alone"
+        ) from error
 
 
 def check_something_to_fit(config: dict[str, Any], close_loop: bool | Sequence[str], traces_log: bool) -> None:

@@ -230,6 +230,7 @@ class TransferAlgorithm(Looping):
                 dynamics_arguments.check_kinds(self.close_loop)
                 dynamics_arguments.check_backend(self.dynamics_config, self.close_loop, traces_log, self._passed)
                 dynamics_arguments.check_something_to_fit(self.dynamics_config, self.close_loop, traces_log)
+                dynamics_arguments.check_carried(self.env, self.close_loop)
                 dynamics_arguments.check_rules(self.dynamics_kwargs, self.observation_space, self.action_space)
             self._setup_model()
             if target_env is not None:

@@ -17,6 +17,9 @@ from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import layers
 from sb3_rpto.envs.state import accepts_seed, restore_state, save_state, whereabouts
 
+#: They scale by what their own world has shown so far.
+NORMALISERS = (gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward)
+
 
 class TargetLedger(VecEnvWrapper):
     """Counts every step of the target by purpose and refuses to go over the budget.
@@ -245,10 +248,12 @@ def check_pair(source: VecEnv, target: VecEnv) -> None:
     if members(source) & members(target):
         raise ValueError("target_env is env: both worlds would step the same object; build a second environment")
     for name, world in (("env", source), ("target_env", target)):
-        if any(isinstance(layer, gym.wrappers.NormalizeObservation) for env in _inside(world) for layer in layers(env)):
+        found = [x for env in _inside(world) for x in layers(env) if isinstance(x, NORMALISERS)]
+        if found:
             raise ValueError(
-                f"{name} is in gymnasium's NormalizeObservation, whose statistics are each world's own and drift; wrap "
-                "env (the source) in stable_baselines3's VecNormalize instead, the target then shares its statistics"
+                f"{name} is in gymnasium's {type(found[0]).__name__}, whose statistics are each world's own and drift; "
+                "wrap env (the source) in stable_baselines3's VecNormalize instead, the target then shares its "
+                "statistics"
             )
     for name in ("observation_space", "action_space"):
         of_source, of_target = getattr(source, name), getattr(target, name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import gymnasium as gym
@@ -20,7 +21,7 @@ from sb3_rpto.envs.observations import (
     state_map,
     strange_wrapper,
 )
-from sb3_rpto.envs.steps import drawn_numbers, odd_memory, odd_state, odd_step
+from sb3_rpto.envs.steps import drawn_numbers, draws_unseeded, odd_memory, odd_state, odd_step
 
 
 def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
@@ -31,6 +32,12 @@ def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
     """
     recover = check_source(env)
     single: Any = single_env(env)
+    if draws_unseeded(single):
+        warnings.warn(
+            f"{env_name(single)}: reset(seed=...) does not decide where an episode begins, so that the copies that the "
+            "policy learns and is judged in all begin alike; draw from self.np_random in reset_model()",
+            stacklevel=2,
+        )
     spec, model = load_model(single)[0], mujoco_model(single)
     plain = model.__copy__() if spec is None else PlainModel.of(spec, model)  # nothing tells the MJCF of some
     return {"model": plain, "recover": recover, "frame_skip": int(single.unwrapped.frame_skip)}

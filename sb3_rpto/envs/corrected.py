@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import gymnasium as gym
 
-from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.effect import LIBRARY, Effect
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.copies import copy_env
@@ -34,3 +34,32 @@ def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:
             "sb3_rpto.effects.stance.StandingEnv(gym.make(...), effects)"
         )
     return StandingEnv(twin, effects)
+
+
+#: Hooks by which effects act in a step of an environment or are seen, with a kind, and its parameter, that shows
+#: whether they can.
+_HOOKS = ((("act", "command"), "command_delay", "delay"), (("observe", "late"), "sensor_bias", "offset"))
+
+
+def check_carries(env: gym.Env, kinds: Sequence[str]) -> None:
+    """Require that effects of some kinds can act in an environment, before anything is spent on looking for them.
+
+    :param env: a gymnasium MuJoCo environment with all its wrappers, untouched; one that cannot be copied passes
+    :param kinds: of effects
+    :raises ValueError: it steps or reads its simulation by ways of its own
+    """
+    for hooks, probe, parameter in _HOOKS:
+        needed = [k for k in kinds if any(getattr(LIBRARY[k], hook) is not getattr(Effect, hook) for hook in hooks)]
+        twin = copy_env(env)
+        if twin is None or not needed:
+            continue
+        places = LIBRARY[probe].places(twin.unwrapped.model)  # type: ignore[attr-defined]
+        if not places:
+            continue
+        twin.action_space.seed(0)
+        try:
+            tried = CorrectedEnv(twin, [LIBRARY[probe](places[0], **{parameter: 1e-3})])
+            tried.reset(seed=0)
+            tried.step(twin.action_space.sample())
+        except ValueError as error:
+            raise ValueError(f"{needed[0]}, for one, could not act in it: {error}") from error

@@ -93,6 +93,26 @@ def drawn_numbers(env: gym.Env) -> list[str]:
     return sorted(name for name in found if not PLACES.fullmatch(name))
 
 
+def draws_unseeded(env: gym.Env) -> bool:
+    """Whether a reset draws where an episode begins from random numbers that its seed does not set.
+
+    Copies of such an environment begin alike whatever their seeds. Nothing is found where it cannot be copied.
+
+    :param env: a MuJoCo environment; untouched
+    """
+    twins = [copy_env(env) for _ in range(2)]
+
+    def begun(twin: gym.Env, seed: int | None) -> np.ndarray:
+        twin.reset(seed=seed)
+        data: mujoco.MjData = twin.unwrapped.data  # type: ignore[attr-defined]
+        return np.concatenate([data.qpos, data.qvel])
+
+    if twins[0] is None or twins[1] is None:
+        return False
+    one, other = (begun(twin, seed) for seed, twin in enumerate(twins) if twin is not None)
+    return np.array_equal(one, other) and not np.array_equal(one, begun(twins[0], None))
+
+
 def odd_state(env: gym.Env, recover: StateMap) -> str | None:
     """Which coordinate the observations do not show as they are said to; None where all are, but for some noise.
 

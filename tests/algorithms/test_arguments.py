@@ -244,11 +244,12 @@ def test_known_effects_that_a_trace_would_refuse_are_refused_before_the_first_st
         physical(close_loop=["spring"], declared=["hinge.damping"], dynamics_kwargs=given)
 
 
+@pytest.mark.parametrize("wrapper", [gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward])
 @pytest.mark.parametrize("normalised", [0, 1])
-def test_statistics_of_one_world_alone_are_refused(normalised):
+def test_statistics_of_one_world_alone_are_refused(normalised, wrapper):
     worlds = [pendulum(), pendulum(12.0)]
-    worlds[normalised] = gym.wrappers.NormalizeObservation(worlds[normalised])
-    with pytest.raises(ValueError, match=r"NormalizeObservation.*VecNormalize"):
+    worlds[normalised] = wrapper(worlds[normalised])
+    with pytest.raises(ValueError, match=rf"{wrapper.__name__}.*VecNormalize"):
         small(RPO, *worlds)
 
 

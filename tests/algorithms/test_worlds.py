@@ -165,6 +165,33 @@ def test_a_reset_that_draws_the_machine_is_refused_and_one_that_places_something
     simulated(gym.wrappers.TimeLimit(Drawing("geom_rgba"), 1_000))
 
 
+class Unseeded(InvertedPendulumEnv):
+    """Its seed decides nothing."""
+
+    def __init__(self, seed: int | None) -> None:
+        self.own = np.random.default_rng(seed)
+        super().__init__()
+
+    def reset_model(self) -> Any:
+        self.set_state(self.own.uniform(-0.1, 0.1, 2), np.zeros(2))
+        return self._get_obs()
+
+
+class Resting(InvertedPendulumEnv):
+    def reset_model(self) -> Any:
+        self.set_state(self.init_qpos, self.init_qvel)
+        return self._get_obs()
+
+
+def test_a_source_whose_copies_would_begin_alike_whatever_their_seeds_is_told() -> None:
+    with pytest.warns(UserWarning, match=r"reset\(seed=\.\.\.\) does not decide.*draw from self\.np_random"):
+        physical_config(gym.wrappers.TimeLimit(Unseeded(0), 1_000))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for env in (Resting(), InvertedPendulumEnv()):
+            physical_config(gym.wrappers.TimeLimit(env, 1_000))
+
+
 def test_a_reset_that_undoes_an_effect_is_told() -> None:
     heavy = declare(Drawing("body_mass").model, ["pole.mass=1:20"])[0].with_values(np.array([9.0]))
     env = apply_effects(Drawing("body_mass"), [heavy])

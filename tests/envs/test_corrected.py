@@ -1,21 +1,24 @@
 """Corrected copies: the source stays as it is, and branches of the copy replay exactly."""
 
+import contextlib
 import copy
 import pickle
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from compared import assert_same, fields
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_rpto import RPTO
 from sb3_rpto.effects import LIBRARY, Declared, Effect, Parameter, declare
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
 from sb3_rpto.effects.model import differing
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.copies import copy_env
-from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.envs.corrected import apply_effects, check_carries
 from sb3_rpto.envs.shifts import EnvShift
 from sb3_rpto.envs.state import restore_state, save_state
 
@@ -182,3 +185,52 @@ def test_what_was_written_to_the_model_is_pickled(again) -> None:
             np.testing.assert_array_equal(made.step(np.full(3, 0.4))[0], other.step(np.full(3, 0.4))[0])
     other.set_effects([])
     assert other.unwrapped.model.body_mass[2] == env.unwrapped.model.body_mass[2]
+
+
+class Direct(type(gym.make(POLE).unwrapped)):
+    """Steps its physics by itself."""
+
+    def do_simulation(self, ctrl, n_frames):
+        self.data.ctrl[:] = ctrl
+        mujoco.mj_step(self.model, self.data, nstep=n_frames)
+
+
+class Own(type(gym.make(POLE).unwrapped)):
+    """Has the method that effects would take the place of."""
+
+    def _step_mujoco_simulation(self, ctrl, n_frames):
+        super()._step_mujoco_simulation(ctrl, n_frames)
+
+
+class Inline(type(gym.make(POLE).unwrapped)):
+    """Observes in step() itself."""
+
+    def step(self, action):
+        self.do_simulation(action, self.frame_skip)
+        return np.concatenate([self.data.qpos, self.data.qvel]), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(
+    ("robot", "kind", "said"),
+    [
+        (Direct, "command_delay", r"command_delay, for one, .*step the physics by self\.do_simulation"),
+        (Direct, "viscous_friction", None),
+        (Own, "torque_ripple", "torque_ripple, for one, .*Own has a _step_mujoco_simulation"),
+        (Own, "sensor_gain", None),
+        (Inline, "sensor_gain", "sensor_gain, for one, .*does not use _get_obs"),
+        (Inline, "command_delay", None),
+    ],
+)
+def test_an_environment_is_asked_for_what_effects_need_of_it(robot, kind, said):
+    env = robot()
+    with pytest.raises(ValueError, match=said) if said else contextlib.nullcontext():
+        check_carries(env, ["armature", kind])
+    assert not {"do_simulation", "_get_obs"} & vars(env).keys()
+
+
+def test_what_a_trace_could_not_add_is_refused_before_a_target_step():
+    """Else it is learned once the steps are spent and traced."""
+    settings = {"dynamics": "physical", "declared": ["pole.length"], "policy_kwargs": {"net_arch": [4]}}
+    with pytest.raises(ValueError, match=r"close_loop=True: .*could not act in it.*or pass close_loop=\[\.\.\.\] with"):
+        RPTO("MlpPolicy", Direct(), target_env=gym.make(POLE), close_loop=True, **settings)
+    RPTO("MlpPolicy", Direct(), target_env=gym.make(POLE), close_loop=["viscous_friction"], **settings)
