@@ -260,9 +260,7 @@ def quantum(velocity: np.ndarray) -> float | None:
     levels = np.unique(velocity)
     if len(moving) < 20 or len(levels) < 3 or 2 * len(np.unique(moving)) >= len(moving):
         return None
-    steps = np.diff(levels)
-    # Levels that differ by rounding alone are one level.
-    return float(steps[steps > 1e-9 * np.ptp(levels)].min())
+    return _least_step(levels) or None
 
 
 def rounding(position: np.ndarray) -> float | None:
@@ -275,8 +273,14 @@ def rounding(position: np.ndarray) -> float | None:
         return None
     if 2 * len(levels) >= len(position):
         return 0.0
+    return _least_step(levels)
+
+
+def _least_step(levels: np.ndarray) -> float:
+    """Between neighbours of some levels, of which those are one that differ by float's rounding; 0 where all do."""
     steps = np.diff(levels)
-    return float(steps[steps > 1e-9 * np.ptp(levels)].min())  # levels that differ by float's rounding are one
+    least = max(1e-9 * np.ptp(levels), 1e-12 * np.abs(levels).max())
+    return float(min(steps[steps > least], default=0.0))
 
 
 def held(positions: np.ndarray) -> int | None:

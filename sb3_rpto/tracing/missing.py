@@ -54,7 +54,7 @@ def _step_by_step(
     steps = np.rint(windows.at[kept, 0]).astype(int)
     rate = (qvel[kept + 1] - predicted[kept, steps]) / (steps * simulation.model.opt.timestep)[:, None]
     force = np.einsum("wij,wj->wi", _inertia(simulation, values, windows.take(kept)), rate)
-    return replace(_rows(r, row[kept]), force=force)
+    return replace(_rows(r, row[kept]), force=force, stopped=None)  # its own steps have the limits in them
 
 
 def _rows(r: ForceResidual, rows: np.ndarray) -> ForceResidual:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.signal import butter, filtfilt
 
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation
+from sb3_rpto.effects.names import SCALAR_JOINTS
 from sb3_rpto.effects.simulation import Active, Switch, collect, filter_commands, names_of, prepare, pushing, settled
 from sb3_rpto.effects.world import BatchWorld, LiveWorld
 from sb3_rpto.tracing.checks import MIN_ROWS
@@ -22,6 +23,10 @@ from sb3_rpto.tracing.windows import command_order
 CUTOFF = 15.0
 #: Ends are left out over so many periods of the cut-off: filters and differences bend them by more than any effect.
 EDGE = 1.5
+#: Random features of the regressor that tells what could still be learned.
+FEATURES = 200
+#: Stretches that it is judged on last so many periods of the cut-off: shorter ones are like their neighbours.
+ALIKE = 2.0
 #: Speeds below this share of the typical one count as rest, where dry friction has no known sign.
 REST = 0.05
 
@@ -38,6 +43,8 @@ class ForceResidual:
     :param command: (T, nu)
     :param force: needed by the motion less what the model has, N·m or N, (T, nv)
     :param touches: whether geoms touch at any time
+    :param stopped: where a joint's own limit may hold it, whose force is not among those that the model has, (T, nv);
+        None: nowhere
     """
 
     episode: str
@@ -48,6 +55,7 @@ class ForceResidual:
     command: np.ndarray
     force: np.ndarray
     touches: bool = False
+    stopped: np.ndarray | None = None
 
 
 def force_residuals(simulation: Simulation, values: np.ndarray, data: Measurements) -> list[ForceResidual]:
@@ -79,10 +87,25 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     load, known = (np.stack([low(column) for column in forces.T], axis=1) for forces in (load, known))
     force = needed - load - known
     edge = 1 if data.whole_states else min(round(EDGE / (_cutoff(h) * h)), len(time) // 4)
-    time, shown, qvel, load, commands, force = (
-        a[edge : len(time) - edge] for a in (time - time[0], shown, qvel, load, commands, force)
+    stopped = _stopped(simulation.model, shown, 0 if data.whole_states else round(1 / (_cutoff(h) * h)))
+    time, shown, qvel, load, commands, force, stopped = (
+        a[edge : len(time) - edge] for a in (time - time[0], shown, qvel, load, commands, force, stopped)
     )
-    return ForceResidual(e.name, time, shown, qvel, load, commands, force, touches)
+    return ForceResidual(e.name, time, shown, qvel, load, commands, force, touches, stopped)
+
+
+def _stopped(model: mujoco.MjModel, shown: np.ndarray, around: int) -> np.ndarray:
+    """Where joints are at their limits or beyond, and so many samples around, over which a filter spreads forces.
+
+    :param shown: positions of scalar joints, (T, nv)
+    """
+    stopped = np.zeros(shown.shape, dtype=bool)
+    for joint in np.flatnonzero(model.jnt_limited):
+        dof, (low, high) = model.jnt_dofadr[joint], model.jnt_range[joint]
+        if model.jnt_type[joint] in SCALAR_JOINTS:
+            beyond = (shown[:, dof] <= low) | (shown[:, dof] >= high)
+            stopped[:, dof] = np.convolve(beyond, np.ones(2 * around + 1), "same") > 0.5
+    return stopped
 
 
 def _motion(
@@ -267,38 +290,46 @@ def typical(simulation: Simulation, residuals: list[ForceResidual]) -> Typical:
 
 
 def summary(residuals: list[ForceResidual]) -> np.ndarray:
-    """Root mean squared force residual of each degree of freedom away from rest, (nv,)."""
+    """Root mean squared force residual of each degree of freedom away from rest and its limits, (nv,)."""
     force = np.concatenate([r.force for r in residuals])
     speed = np.abs(np.concatenate([r.qvel for r in residuals]))
     moving = speed > REST * np.quantile(speed, 0.95, axis=0)
+    moving &= np.concatenate([np.ones_like(r.force, bool) if r.stopped is None else ~r.stopped for r in residuals])
     return np.array([np.sqrt(np.mean(f[m] ** 2)) if m.any() else 0.0 for f, m in zip(force.T, moving.T)])
 
 
-def learnable_share(residuals: list[ForceResidual], seed: int, features: int = 200) -> np.ndarray:
+def learnable_share(residuals: list[ForceResidual], seed: int, filtered: bool = True) -> np.ndarray:
     """Share of the force residual's variance that a small regressor predicts on unseen stretches, (nv,).
 
     Ridge regression on random tanh features of position, velocity, load and their recent past: the upper bound of
-    what a learned correction could still add. Zero when it predicts nothing, or when too little is left to judge on.
+    what a learned correction could still add. Zero when it predicts nothing, NaN where all runs are too short to judge
+    on: the stretches, eighths of runs, are to be longer than what a filter makes alike. Samples at limits are left out.
 
     :param residuals: of all episodes
     :param seed: of the features
-    :param features: number of them
+    :param filtered: whether they come from measured positions, not from a simulator's exact states
     """
     rng = np.random.default_rng(seed)
     inputs, targets, fold = [], [], []
     for number, r in enumerate(residuals):
-        lag = max(1, round(0.02 / max(float(np.median(np.diff(r.time))), 1e-6)))
+        h = float(r.time[-1] - r.time[0]) / max(len(r.time) - 1, 1)
+        if not h or (filtered and len(r.time) * h < 8 * ALIKE / _cutoff(h)):
+            continue
+        lag = max(1, round(0.02 / h))
         now = np.concatenate([np.sin(r.qpos), np.cos(r.qpos), r.qvel, np.sign(r.qvel), r.load], axis=1)
         inputs.append(np.concatenate([now, np.roll(np.concatenate([r.qvel, r.load], 1), lag, axis=0)], axis=1)[lag:])
         targets.append(r.force[lag:])
         half = np.arange(len(r.force) - lag) * 8 // max(1, len(r.force) - lag)
         fold.append((half + number) % 2)
+        if r.stopped is not None:
+            free = ~r.stopped[lag:].any(axis=1)
+            inputs[-1], targets[-1], fold[-1] = inputs[-1][free], targets[-1][free], fold[-1][free]
+    if len({part for parts in fold for part in parts.tolist()}) < 2:
+        return np.full(residuals[0].force.shape[1], np.nan)
     x, y, part = np.concatenate(inputs), np.concatenate(targets), np.concatenate(fold)
-    if len(np.unique(part)) < 2:
-        return np.zeros(y.shape[1])
     x = (x - x.mean(0)) / (x.std(0) + 1e-9)
     hidden = np.tanh(
-        x @ rng.standard_normal((x.shape[1], features)) / np.sqrt(x.shape[1]) + rng.uniform(-1, 1, features)
+        x @ rng.standard_normal((x.shape[1], FEATURES)) / np.sqrt(x.shape[1]) + rng.uniform(-1, 1, FEATURES)
     )
     design = np.concatenate([np.ones((len(x), 1)), x, hidden], axis=1)
     left = np.zeros_like(y)

@@ -167,7 +167,11 @@ def trace(
         floor=floor,
         force_before=summary(residuals_before) if residuals_before else unknown,
         force_after=summary(residuals_after) if residuals_after else unknown,
-        learnable=learnable_share(residuals_after, seed) if residuals_after and not rounding else unknown,
+        learnable=(
+            learnable_share(residuals_after, seed, not data.whole_states)
+            if residuals_after and not rounding
+            else unknown
+        ),
         residuals_before=residuals_before,
         residuals_after=residuals_after,
         findings=findings,

@@ -1395,7 +1395,7 @@ def test_what_an_earlier_simulator_said_undoes_nothing(soon: None, monkeypatch: 
     assert made.loop is not None
     made.loop.watch(made)
     made.loop.watch(made)  # worse, but not clearly
-    made.loop.accounts, made.loop.stale = False, True
+    made.loop.accounts, made.loop.stale, made.loop._traced_at = False, True, 1
     made.loop.renew(made)  # learns in a simulator that may not judge
     learned_there = weights(made)
     made.rollback("simulator")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from simulated import RATE, WITH_WHEEL, compiled, recorded
+from simulated import PENDULUM, RATE, WITH_WHEEL, compiled, recorded
 
 from sb3_rpto.effects import Drive, Simulation, declare
 from sb3_rpto.effects.effect import Effect
@@ -241,7 +241,28 @@ def test_half_noise_is_half_learnable_joint_by_joint() -> None:
 
 def test_too_few_samples_to_judge_on_have_no_learnable_share() -> None:
     """A test run of an episode that ended at once leaves a sample or two."""
-    np.testing.assert_array_equal(learnable_share(made(lambda q, v, rng: -v, 1, 2), 0), 0)
+    assert np.isnan(learnable_share(made(lambda q, v, rng: -v, 1, 2), 0)).all()
+
+
+def test_a_share_of_short_runs_is_none_and_short_runs_beside_long_ones_change_none() -> None:
+    """An eighth of a short run is like the one before it, and so is predicted."""
+    law = made(lambda q, v, rng: np.tanh(v), 3, 800)
+    assert np.isnan(learnable_share(made(lambda q, v, rng: np.tanh(v), 4, 25), 0)).all()
+    np.testing.assert_array_equal(
+        learnable_share([*law, *made(lambda q, v, rng: 0 * v, 4, 25)], 0), learnable_share(law, 0)
+    )
+
+
+def test_a_limits_own_force_is_not_missing() -> None:
+    model = compiled(PENDULUM.replace('axis="0 -1 0"', 'axis="0 -1 0" range="-20 20" limited="true"'))
+    data = recorded([], model, episodes=2, duration=3.0, noise=0.0, start=[0.1, 0.1])
+    assert any(np.abs(e.qpos).max() > np.deg2rad(20) for e in data.episodes)
+    simulation = Simulation(model, [], 1)
+    found = force_residuals(simulation, simulation.values(), data)
+    pushed = np.concatenate([r.force[r.stopped[:, 0], 0] for r in found if r.stopped is not None])
+    load = np.concatenate([r.load for r in found])
+    assert np.abs(pushed).max() > 0.5 * np.abs(load).max()
+    assert summary(found)[0] < 0.05 * np.sqrt(np.mean(load**2))
 
 
 def test_learnable_share_of_nothing_is_zero_and_the_same_for_a_seed() -> None:
