@@ -79,7 +79,7 @@ Say which effect a simulator lacks to explain recordings of a machine.
 
 The declared parameters of the model are fitted to the recordings first. Where the
 fitted model still errs by more than the measurement noise, friction, delays, offsets
-and some thirty other effects are tried at all joints and motors. The verdict is
+and two dozen other effects are tried at all joints and motors. The verdict is
 complete, explained, partly explained or unexplained.
 """
 

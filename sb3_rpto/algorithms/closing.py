@@ -55,7 +55,8 @@ class LoopCloser:
     """Decides when to trace, traces, and takes what is found into phi; it never spends a target step.
 
     :param declared: names of the numbers that the user declared
-    :param kinds: of effects to look for; True: all; none of them: the declared numbers alone are fitted
+    :param kinds: of effects to look for; True: all; none of them: the declared numbers alone are fitted; False: those
+        on a robot's log, and transitions are never traced
     """
 
     #: called with each report, before the policy learns in what it corrects; no checkpoint holds it
@@ -109,13 +110,12 @@ class LoopCloser:
         size, capacity = buffer.target.size(), buffer.target.buffer_size
         if self._traced_at is None:
             return self.first_comes_after(model) <= 0
-        if buffer.target_added < self._traced_at:  # loaded without its buffer
-            self._traced_at = 0
-        new = min(buffer.target_added - self._traced_at, size)
+        traced_at = self._traced_at if self._traced_at <= buffer.target_added else 0  # loaded without its buffer
+        new = min(buffer.target_added - traced_at, size)
         if new < min(AGAIN, capacity):
             return False
-        more = buffer.target_added >= MORE * self._traced_at
-        blurred = dynamics.observation_noise is not None and self._traced_at < ENOUGH
+        more = buffer.target_added >= MORE * traced_at
+        blurred = dynamics.observation_noise is not None and traced_at < ENOUGH
         if more and (blurred or self._untraced or not self.found or self.found[-1]["verdict"] not in SETTLED):
             return True
         error = dynamics.error(model.transitions("target").take(slice(size - new, None)))

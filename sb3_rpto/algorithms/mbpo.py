@@ -24,9 +24,9 @@ class MBPO(TransferAlgorithm):
     It is the loop of :class:`~sb3_rpto.RPTO` with RTO's weights left out (``weighting=None``), branches from states of
     D_target alone, and one batch for critic and actor alike: D_source with a share ``real_ratio`` of D_target.
 
-    What others change of it are five methods: ``_make_source_world`` (where branches start, which answer is kept: PDML,
-    PTP), ``fit_weights`` and ``_fit_to_transitions`` (how the model is fitted: PDML, PTP), ``_make_dynamics`` and
-    ``update`` (another loss, another policy optimiser: SLBO).
+    Of it PDML and PTP change above all ``_make_source_world`` (where branches start, which answer is kept) and how the
+    model is fitted (``fit_weights``, ``_fit_to_transitions``), SLBO ``_make_dynamics`` and ``update`` (another loss,
+    another policy optimiser).
 
     :param args: as those of :class:`~sb3_rpto.algorithms.transfer.TransferAlgorithm`
     :param kwargs: likewise, without those in :attr:`unused`; what is not passed is :meth:`published`

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch as th
@@ -73,13 +73,11 @@ class ErrorNetwork(nn.Module):
     scale: th.Tensor
     fitted: th.Tensor
 
-    def __init__(
-        self, observation_dim: int, action_dim: int, hidden: Sequence[int] = (256, 256), learning_rate: float = 5e-4
-    ) -> None:
+    def __init__(self, observation_dim: int, action_dim: int) -> None:
         super().__init__()
         n_inputs = 2 * observation_dim + action_dim + 1
-        self.network = nn.Sequential(*create_mlp(n_inputs, 1, list(hidden)))
-        self.optimizer = th.optim.Adam(self.network.parameters(), lr=learning_rate)
+        self.network = nn.Sequential(*create_mlp(n_inputs, 1, [256, 256]))
+        self.optimizer = th.optim.Adam(self.network.parameters(), lr=5e-4)
         self.register_buffer("input_mean", th.zeros(n_inputs))
         self.register_buffer("input_std", th.ones(n_inputs))
         self.register_buffer("scale", th.ones(()))

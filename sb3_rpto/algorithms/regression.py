@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import torch as th
 
+BATCH = 256
+
 
 def regress(
     predict: Callable[[th.Tensor], th.Tensor],
@@ -13,8 +15,6 @@ def regress(
     inputs: th.Tensor,
     goals: th.Tensor,
     n_steps: int,
-    batch_size: int = 256,
-    generator: th.Generator | None = None,
 ) -> float:
     """Minimise the mean squared error of ``predict(inputs)`` in minibatch steps.
 
@@ -22,14 +22,12 @@ def regress(
     :param optimizer: of the parameters that move
     :param inputs: (n, n_inputs)
     :param goals: (n, ...)
-    :param n_steps: gradient steps
-    :param batch_size: rows of a step, drawn with replacement
-    :param generator: draws them; None: torch's own
+    :param n_steps: gradient steps, each on :data:`BATCH` rows drawn with replacement
     :return: mean loss over the last tenth of the steps
     """
     losses = []
     for _ in range(n_steps):
-        rows = th.randint(len(inputs), (batch_size,), generator=generator)
+        rows = th.randint(len(inputs), (BATCH,))
         loss = (predict(inputs[rows]) - goals[rows]).square().mean()
         optimizer.zero_grad()
         loss.backward()

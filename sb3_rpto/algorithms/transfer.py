@@ -327,7 +327,7 @@ class TransferAlgorithm(Looping):
         self: Self,
         total_timesteps: int = 10_000,
         callback: MaybeCallback = None,
-        log_interval: int = 4,
+        log_interval: int | None = 4,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
@@ -339,13 +339,13 @@ class TransferAlgorithm(Looping):
         :param total_timesteps: budget of TARGET steps, never exceeded (with ``target_data``: of source steps, and
             all copies take their last one)
         :param callback: as in SB3; called once per target step
-        :param log_interval: target episodes between two logs
+        :param log_interval: target episodes between two logs; None logs nothing
         :param tb_log_name: name of the TensorBoard run, by default the class's name
         :param reset_num_timesteps: whether ``total_timesteps`` counts from zero
         :param progress_bar: show one bar for the source phase and one for the target
         :param source_timesteps: source steps that train a model which is neither warm-started nor trained before;
             default 10 x ``total_timesteps``, at most 300,000; 0 skips the phase
-        :raises ValueError: without a target, or for a budget that is not positive
+        :raises ValueError: what :func:`~sb3_rpto.algorithms.arguments.check_ready` refuses, such as no target
         """
         arguments.check_ready(self, total_timesteps, source_timesteps, log_interval)
         if source_timesteps is None:

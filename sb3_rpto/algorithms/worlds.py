@@ -318,12 +318,14 @@ class NullShiftCheck:
     state cannot be carried over (processes, environments that cannot save their state) nothing is claimed.
 
     :param source: the source; untouched
-    :param target: the target, just reset
-    :param n_steps: how many transitions to compare
+    :param target: the target
     """
 
-    def __init__(self, source: VecEnv, target: VecEnv, n_steps: int = 20) -> None:
-        self._left = n_steps
+    #: transitions to compare
+    N_STEPS = 20
+
+    def __init__(self, source: VecEnv, target: VecEnv) -> None:
+        self._left = self.N_STEPS
         self._copy: DummyVecEnv | None = None
         start, twin = _single_state(target), copy_env(source)
         if start is None or twin is None:
@@ -342,7 +344,7 @@ class NullShiftCheck:
         :param actions: (1, action_dim), what the target's first environment received
         :param next_observation: (observation_dim,), what it answered
         :param done: whether its episode ended
-        :return: True once all of ``n_steps`` transitions (or the first episode) agreed, False once one did not or
+        :return: True once all :attr:`N_STEPS` transitions (or the first episode) agreed, False once one did not or
             when nothing can be claimed, None while it is not known
         """
         if self._copy is None:

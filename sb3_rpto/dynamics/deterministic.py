@@ -57,7 +57,7 @@ class DeterministicDynamics(EnsembleDynamics):
 
     Rewards and terminations that are not known as rules are heads of the same network, trained by absolute error and
     cross entropy. The scaler is fitted by the first :meth:`fit`, as in
-    :class:`~sb3_rpto.dynamics.ensemble.EnsembleDynamics`; there is no holdout.
+    :class:`~sb3_rpto.dynamics.ensemble.EnsembleDynamics`; nothing is held out but a fifth of the rows of the scaler.
 
     :param observation_space: flat Box
     :param action_space: flat Box

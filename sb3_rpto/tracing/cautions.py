@@ -15,7 +15,7 @@ from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE, Adequacy
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor, observed, predictions
-from sb3_rpto.tracing.identify import SETTLED, Problem
+from sb3_rpto.tracing.identify import START_STEPS, Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.misread import CLEARLY
 from sb3_rpto.tracing.prepare import SHORTER, SetUp
@@ -84,7 +84,7 @@ def _from_fitted_starts(
 ) -> float:
     """Root mean squared error over a horizon in units of the noise, the windows' starts fitted."""
     windows = cut(simulation.model, data, sigma, horizon, STEPPED)
-    fit = Problem(simulation, windows, [Scales()] * len(simulation.effects)).score(values, iterations=SETTLED)
+    fit = Problem(simulation, windows, [Scales()] * len(simulation.effects)).score(values, iterations=START_STEPS)
     return float(np.sqrt(np.mean(fit.errors**2)))
 
 

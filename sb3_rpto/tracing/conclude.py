@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from sb3_rpto.effects import LIBRARY, Declared, Effect
-from sb3_rpto.tracing import identify
 from sb3_rpto.tracing.adequacy import SETTLED, TOLERANCE, adequacy, judge
 from sb3_rpto.tracing.cautions import DRY, WORSE, creeping
 from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.identify import START_STEPS
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.origin import may_be_exact, met_exactly, origin
 from sb3_rpto.tracing.prepare import Progress, SetUp
@@ -140,7 +140,7 @@ def hidden(found: Found, seed: int) -> bool:
     select, values = found.on.fine.select, found.selection.model.fit.values
     if select is None or found.after.adequate:
         return False
-    return adequacy(select, select.score(values, iterations=identify.SETTLED), seed).adequate
+    return adequacy(select, select.score(values, iterations=START_STEPS), seed).adequate
 
 
 def _explains(found: Found) -> bool:

@@ -31,7 +31,7 @@ CRUDE = 0.01
 #: All windows' errors below so many units of the noise, for exact data 1e-7 of what a position varies by, are met.
 MET = 1e-3
 #: Steps of the starts by themselves after which a verdict may rest on them; none where all fall by less than a share.
-SETTLED, STILL = 10, 1e-3
+START_STEPS, STILL = 10, 1e-3
 #: Most simulations in one batch.
 CHUNK = 6000
 
@@ -414,7 +414,7 @@ class Problem:
         """
         if self.windows.noisy_starts:
             generators = np.random.default_rng(seed).spawn(draws)
-            drawn = (self.redrawn(fit, rng).score(fit.values, iterations=SETTLED) for rng in generators)
+            drawn = (self.redrawn(fit, rng).score(fit.values, iterations=START_STEPS) for rng in generators)
             return np.array([each.errors for each in drawn])
         _, _, jx = self.linearise(fit.values, fit.starts, np.empty(0, dtype=int))
         w = self.windows

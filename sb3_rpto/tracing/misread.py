@@ -14,7 +14,7 @@ from sb3_rpto.effects.names import SCALAR_JOINTS, object_names
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.columns import Columns, joint_of
 from sb3_rpto.tracing.episodes import Episode
-from sb3_rpto.tracing.identify import SETTLED, Problem
+from sb3_rpto.tracing.identify import START_STEPS, Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.prepare import SetUp
 from sb3_rpto.tracing.search import Found
@@ -108,7 +108,7 @@ def misread(found: Found, set_up: SetUp) -> list[Finding]:
     # The declared numbers alone may promise more: what was found makes up for the way of reading.
     begins = (model.fit.values, found.base.fit.values)
     as_read = problem(lambda episode: episode, range(len(set_up.sigma)))
-    usual = float(np.median(as_read.score(begins[0], iterations=SETTLED).errors))
+    usual = float(np.median(as_read.score(begins[0], iterations=START_STEPS).errors))
     tried = []
     for reading in readings(set_up.nominal, data):
         there = problem(reading.again, reading.order)

@@ -11,7 +11,7 @@ from sb3_rpto.tracing.adequacy import Adequacy, adequacy, counted_with
 from sb3_rpto.tracing.calibrate import calibrated
 from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evidence import GAIN
-from sb3_rpto.tracing.identify import SETTLED, Fit, Problem
+from sb3_rpto.tracing.identify import START_STEPS, Fit, Problem
 from sb3_rpto.tracing.kinds import few_kinds
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.screen import Screening, screen
@@ -310,9 +310,9 @@ def judged(selector: Selector, model: Model, seed: int) -> Adequacy:
     What a robust fit gives up of the windows that it was made to counts, too: the runs to judge on may be few, or move
     as none of the others did. Where they show enough by themselves, one odd run among those fitted is only told.
     """
-    seen = adequacy(selector.judging, selector.judging.score(model.fit.values, iterations=SETTLED), seed)
+    seen = adequacy(selector.judging, selector.judging.score(model.fit.values, iterations=START_STEPS), seed)
     if selector.select is None:
         return seen
     count, train = len(selector.select.windows), selector.train
-    fitted = adequacy(train, train.score(model.fit.values, iterations=SETTLED), seed)
+    fitted = adequacy(train, train.score(model.fit.values, iterations=START_STEPS), seed)
     return counted_with(seen, count, fitted, len(train.windows)) if count < FEW or fitted.spread else seen
