@@ -42,6 +42,7 @@ def test_a_model_that_few_windows_pass_is_told_where_the_test_runs_deny_it(
     assert above_noise(errors, [FLOOR], ratio, length=1.1) == []  # over so little the starts decide
 
 
+@pytest.mark.slow
 def test_a_light_joint_under_noise_for_commands_is_missed_by_the_model_of_another_load_alone() -> None:
     light = PENDULUM.replace('mass="0.5"', 'mass="0.01"').replace('damping="0.05"', 'damping="0.005"')
     commands = np.random.default_rng(4).uniform(-0.8, 0.8, (2, 210))

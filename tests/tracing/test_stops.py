@@ -32,6 +32,7 @@ def traced(
     return trace(source, Measurements.from_replay(agent.replay_buffer, source), declared, candidates=kinds, threads=1)
 
 
+@pytest.mark.slow
 def test_stops_that_few_windows_reach_are_found() -> None:
     report = traced("Reacher-v5", ["body0.length", "body1.length"], 300, joint1=(-1.5, 1.6))
     assert report.verdict == "explained"

@@ -17,7 +17,11 @@ from sb3_rpto.tracing.wording import VERDICTS, verdict
 
 
 @pytest.mark.parametrize(
-    ("damping", "mass", "bodies"), [(0.5, 0.5, []), (0.05, 0.4, ["pole"])], ids=["fitted anew", "another mass"]
+    ("damping", "mass", "bodies"),
+    [
+        pytest.param(0.5, 0.5, [], marks=pytest.mark.slow, id="fitted anew"),
+        pytest.param(0.05, 0.4, ["pole"], id="another mass"),
+    ],
 )
 def test_a_mass_is_not_named_for_what_fitting_the_declared_numbers_does(
     damping: float, mass: float, bodies: list[str]

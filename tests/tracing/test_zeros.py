@@ -111,6 +111,7 @@ def test_a_corrected_model_tells_the_zeros_of_other_runs() -> None:
         traced(0.0, 0.0, 0.05).zeros_of(new)
 
 
+@pytest.mark.slow
 def test_a_joint_that_was_at_rest_says_nothing_of_new_zeros(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
     monkeypatch.setattr("sb3_rpto.tracing.report.zeros_of", lambda *args: seen.append(args[2]))
@@ -119,6 +120,7 @@ def test_a_joint_that_was_at_rest_says_nothing_of_new_zeros(monkeypatch: pytest.
     assert seen[0].unobserved == ("hinge",)
 
 
+@pytest.mark.slow
 def test_every_run_is_told_its_zero_and_one_without_a_window_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_rpto.tracing.zeros.TRAIN", 2)
     monkeypatch.setattr("sb3_rpto.tracing.zeros.SELECT", 1)
