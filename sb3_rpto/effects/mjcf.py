@@ -13,6 +13,9 @@ import numpy as np
 
 from sb3_rpto.effects.model import numbers, same_layout, set_number
 
+#: Statistics that MuJoCo derives, simulates nothing by, and will not read in an MJCF for ever.
+MEANS = ("meaninertia", "meanmass", "meansize")
+
 Rounded: TypeAlias = dict[str, dict[str, list[Any]]]
 
 
@@ -54,6 +57,7 @@ def write_mjcf(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[str, dict[st
     :raises ValueError: such a file is not the one that MuJoCo reads
     """
     spec = spec.copy()
+    means = {name: getattr(spec.stat, name) for name in MEANS}
     compiled = spec.compile()
     _tell_inertia(spec, compiled)
     _tell_derived(spec, compiled)
@@ -62,6 +66,8 @@ def write_mjcf(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[str, dict[st
         spec.copy_back(model)
     except ValueError:
         _copy_some(spec, model)
+    for name, value in means.items():
+        setattr(spec.stat, name, value)
     assets = _gather(spec, compiled)
     moved = spec.compile()
     for name in ("mesh_vert", "hfield_data", "skin_vert", "tex_data"):

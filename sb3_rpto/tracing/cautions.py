@@ -341,6 +341,24 @@ def encoder_zeros(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Findin
     return found
 
 
+def tied_sensors(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Finding]:
+    """Faults of sensors at joints that an equality ties: another ratio or offset of the tie shows as such ones do."""
+    tied = {
+        int(joint)
+        for i in np.flatnonzero((model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & model.eq_active0.astype(bool))
+        for joint in (model.eq_obj1id[i], model.eq_obj2id[i])
+    }
+    message = (
+        "an equality constraint ties this joint: where its polycoef is off, the sensors seem to be, and declared "
+        "numbers beside them lie outside of their intervals; check the tie"
+    )
+    return [
+        Finding("tied sensor", effect.label, message)
+        for effect in named
+        if effect.overrides("observe") and joint_of(effect, model) in tied
+    ]
+
+
 def idle_start(late: Sequence[Effect]) -> list[Finding]:
     """What is late acts on zeros when a run begins, see :func:`sb3_rpto.tracing.origin.idle`.
 

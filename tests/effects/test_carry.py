@@ -601,3 +601,12 @@ def test_without_an_environment_a_correction_is_simulated(tmp_path) -> None:
     slowed = simulation.rollout(simulation.values()[None], *start, drive)[1][0, -1, 1]
     free = simulation.rollout(simulation.null[None], *start, drive)[1][0, -1, 1]
     assert abs(slowed) < abs(free)
+
+
+@pytest.mark.parametrize("name", ["Hopper-v5", "Ant-v5"])
+def test_a_plain_model_is_written_as_the_model_was(name):
+    spec, model = load_model(gym.make(name))
+    plain = mjcf.PlainModel.of(spec, model)
+    text, _ = mjcf.write_mjcf(mujoco.MjSpec.from_string(plain.text, assets=plain.assets), plain.compile())
+    assert text == plain.text
+    assert "meaninertia" not in text

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from simulated import PENDULUM, compiled, recorded
+from simulated import PENDULUM, WITH_WHEEL, compiled, recorded
 
 from sb3_rpto.effects import LIBRARY, Simulation
 from sb3_rpto.effects.forces import Spring, TorqueOffset
@@ -18,6 +18,7 @@ from sb3_rpto.tracing.cautions import (
     missed,
     no_nearer,
     own_steps,
+    tied_sensors,
 )
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Problem
@@ -58,6 +59,16 @@ def test_a_light_joint_under_noise_for_commands_is_missed_by_the_model_of_anothe
     assert after[0].rmse > 10 * floor[0].rmse  # what smoothing shifts the starts by is no part of the floor
     assert missed(own, own.null, data, sigma, 0) == []
     assert [f.where for f in missed(other, other.null, data, sigma, 0)] == ["0, 1"]
+
+
+def test_a_sensor_at_a_tied_joint_is_told() -> None:
+    xml = WITH_WHEEL.replace(
+        "<actuator>", '<equality><joint joint1="hinge" joint2="axle" active="{}"/></equality><actuator>'
+    )
+    on, off, free = (compiled(text) for text in (xml.format("true"), xml.format("false"), WITH_WHEEL))
+    named = [LIBRARY["sensor_gain"]("axle", change=0.1), LIBRARY["coulomb_friction"]("hinge", level=0.1)]
+    assert [f.where for f in tied_sensors(on, named)] == ["sensor_gain(axle)"]
+    assert tied_sensors(off, named) == tied_sensors(free, named) == []
 
 
 def test_what_explains_nothing_and_predicts_worse_is_told() -> None:
