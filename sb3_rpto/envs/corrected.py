@@ -50,11 +50,9 @@ def check_carries(env: gym.Env, kinds: Sequence[str]) -> None:
     """
     for hooks, probe, parameter in _HOOKS:
         needed = [k for k in kinds if any(getattr(LIBRARY[k], hook) is not getattr(Effect, hook) for hook in hooks)]
-        twin = copy_env(env)
-        if twin is None or not needed:
-            continue
-        places = LIBRARY[probe].places(twin.unwrapped.model)  # type: ignore[attr-defined]
-        if not places:
+        twin = copy_env(env) if needed else None
+        places = [] if twin is None else LIBRARY[probe].places(twin.unwrapped.model)  # type: ignore[attr-defined]
+        if twin is None or not places:
             continue
         twin.action_space.seed(0)
         try:
