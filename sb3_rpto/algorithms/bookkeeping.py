@@ -149,8 +149,7 @@ class TwoWorlds(PolicySnapshots):
         self._bind_rules(venv, of_target=True)
         self._has_target_rules = False  # but of the last one
         self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
-        self._offline = self._traces_log = False
-        self._judged_target = self._judged_rules = False
+        self._offline = self._traces_log = self._judged_target = self._judged_rules = False
         self._last_obs = self._null_check = None
         seed = self.seed if self._new_seed is None else self._new_seed
         if seed is not None:
