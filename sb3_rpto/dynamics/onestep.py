@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -28,6 +29,8 @@ REACHES = 0.25 ** np.arange(5)
 UNSEEN, VAGUE = 1e-3, 1.0
 #: Scores of so many transitions in a row may be correlated.
 LAGS = 4
+#: Weight, relative to the data's, of the wish that a step be small.
+RIDGE = 1e-4
 #: Contacts make local optima: the loss turns linear at so many typical residuals, so that a missed touch-down is borne.
 CLIP = 3.0
 #: Residuals of what blows up, in standard one-step changes.
@@ -237,12 +240,9 @@ class OneStep:
         shown = _shown(a, b)
         self.unseen &= ~shown
         free = np.flatnonzero(shown & ~self.held & ~self.left)
-        size = np.sqrt((a**2).sum(axis=0))
         moved = values.copy()
         if len(free):
-            # Directions that the data hardly tell apart share a move.
-            a = np.concatenate([a[:, free], np.diag(1e-4 * size[free])])
-            b = np.concatenate([b, np.zeros(len(free))])
+            a, b = _ridged(a[:, free], b)
             low, high = ((bound - values)[free] / self.scale[free] for bound in (self.lower, self.upper))
             far = reach * np.maximum(1.0, np.abs(values[free]) / self.scale[free])
             # The solver wants boxes with an inside.
@@ -276,8 +276,10 @@ class OneStep:
         """Parameters that the transitions show, if at all, too faintly to tell: :data:`VAGUE`; (p,).
 
         One after the other, the vaguest first: of two that act almost alike the other may be told given the one.
+        Judged where a whole step would lead: what phi still has to go for is no noise.
         """
-        curvature, free = self._curvature(values), ~self.held & ~self.left & ~self.unseen
+        free = ~self.held & ~self.left & ~self.unseen
+        curvature = self._curvature(values, np.flatnonzero(free))
         found = self.unseen.copy()
         while free.any():
             spread = np.where(free, np.sqrt(np.diag(self._covariance(*curvature, free))), 0.0)
@@ -287,9 +289,15 @@ class OneStep:
             free[worst], found[worst] = False, True
         return found
 
-    def _curvature(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of the cost at phi, in scales: about its Hessian (p, p), and each transition's part of its slope (n, p)."""
+    def _curvature(self, values: np.ndarray, gone: Sequence[int] | np.ndarray = ()) -> tuple[np.ndarray, np.ndarray]:
+        """Of the cost at phi, in scales: about its Hessian (p, p), and each transition's part of its slope (n, p).
+
+        :param gone: parameters whose whole linear step the residuals are taken after
+        """
         residual, slopes = self.linearise(values, DIFFERENCES[1])
+        if len(gone):
+            a, b = self._weighted(residual, slopes[:, :, gone])
+            residual = residual + slopes[:, :, gone] @ np.linalg.lstsq(*_ridged(a, b))[0]
         # The loss's own second derivative: the least squares that stand for it in a step curve more.
         curved = self.share[:, None] * (1 + (residual / self.clip) ** 2) ** -1.5
         hessian = np.einsum("nc,ncp,ncq->pq", curved, slopes, slopes)
@@ -320,6 +328,11 @@ def _shown(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Which parameters move the residuals ``b`` (m,) at all, by the derivatives ``a`` (m, p); (p,)."""
     size = np.sqrt((a**2).sum(axis=0))
     return np.asarray(size >= UNSEEN * max(float(np.sqrt((b**2).sum())), 1e-6))
+
+
+def _ridged(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The least squares ``a x = b`` in which directions that the data hardly tell apart share a move."""
+    return np.concatenate([a, np.diag(RIDGE * np.sqrt((a**2).sum(axis=0)))]), np.concatenate([b, np.zeros(a.shape[1])])
 
 
 def _clip(residual: np.ndarray) -> float:

@@ -194,6 +194,33 @@ class ServoDamping(Effect):
 
 
 @register
+class VelocityServoGain(Effect):
+    r"""A velocity servo of another gain, :math:`(1 + g)\,k_v\,(u - \dot q)`: MuJoCo's ``kv``.
+
+    A ``command_gain`` changes what is commanded alone, not how hard the servo holds against a load.
+    """
+
+    kind = "velocity_servo_gain"
+    place = "actuator"
+    parameters = (Parameter("change", "", 0.03, lower=-0.9, upper=9.0),)
+    equation = "(1 + change) kv (u - qd)"
+    native = "kv"
+    excite = "commands that jump, and loads that slow the servo"
+    same = ("kv", "strength")
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Velocity servos."""
+        every = super().places(model)
+        return [name for name in every if servo_of(model, object_id(model, "actuator", name)) == "velocity"]
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Scale the gain and what it takes back."""
+        world.field("actuator_gainprm")[:, self.index, 0] *= 1 + x[:, 0]
+        world.field("actuator_biasprm")[:, self.index, 2] *= 1 + x[:, 0]
+
+
+@register
 class CommandSaturation(Effect):
     r"""A limit of the amplifier, :math:`\mathrm{clip}(u, -1/s, 1/s)`, by its inverse: 0 is no limit.
 

@@ -311,6 +311,14 @@ def register(effect: type[Effect]) -> type[Effect]:
         raise ValueError(f"{effect.__name__}: parameters is {effect.parameters!r}; give a tuple of Parameter")
     if all(getattr(effect, hook) is getattr(Effect, hook) for hook in HOOKS):
         raise ValueError(f"{effect.__name__} does nothing; override one of {', '.join(HOOKS)}")
+    if (effect.observe is Effect.observe) != (effect.unobserve is Effect.unobserve):
+        raise ValueError(f"{effect.__name__}: observe and its inverse, unobserve, go together; override both")
+    parameters = [p.name for p in effect.parameters]
+    if len({*parameters}) < len(parameters):
+        raise ValueError(f"{effect.__name__}: parameters have the names {', '.join(parameters)}; give each its own")
+    for p in effect.parameters:
+        if not callable(p.size) and not p.size > 0:
+            raise ValueError(f"{effect.__name__}: size of {p.name} is {p.size}; give a plausible small one, above 0")
     LIBRARY[effect.kind] = effect
     return effect
 

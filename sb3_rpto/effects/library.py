@@ -28,6 +28,7 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
     actuator on a hinge or slide without activation        dc_motor
     position servo                                         servo_gain
     position servo with damping                            servo_damping
+    velocity servo                                         velocity_servo_gain
     moving body that has mass                              payload
     moving body that has a capsule                         link_length
     geom that may touch another with friction              geom_friction
@@ -38,8 +39,8 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
     ``frictionloss`` coulomb_friction, ``stiffness`` spring, ``range`` end_stop, ``armature`` armature, ``arm.length``
     link_length(arm), a geom's ``friction`` geom_friction, its ``timeconst`` or ``dampratio`` contact_softness, an
     actuator's ``gain``, ``gear`` or ``strength`` command_gain, its ``kp`` or ``strength`` servo_gain,
-    its ``kv`` servo_damping, ``option.density`` and ``option.viscosity`` fluid. A declared mass leaves payload in: it
-    moves the centre of mass too.
+    its ``kv`` servo_damping or, of a velocity servo, velocity_servo_gain, ``option.density`` and ``option.viscosity``
+    fluid. A declared mass leaves payload in: it moves the centre of mass too.
     soft_friction, held forces and gravity_scale, which no machine has, mass_scale, com_offset, contact_softness,
     external_force, command_offset and command_smoothing are left out unless they are named.
 

@@ -11,6 +11,8 @@ from sb3_rpto.effects.simulation import Drive, Simulation
 #: Simulations at once, of different parameters, and steps of each; the middle one begins at rest, those beside it at
 #: this speed in rad/s or m/s.
 N, STEPS, SPEED = 3, 4, 0.1
+#: An inverse may be off by this share of what it takes back.
+UNDONE = 0.1
 
 
 def try_out(model: mujoco.MjModel, effect: Effect) -> None:
@@ -18,7 +20,8 @@ def try_out(model: mujoco.MjModel, effect: Effect) -> None:
 
     :param model: that it is an effect of
     :param effect: of a class of the user's own
-    :raises ValueError: a hook raises an error, or what comes of it is not finite; the message names effect and hooks
+    :raises ValueError: a hook raises an error, mixes simulations, or what comes of it is not finite, or ``unobserve``
+        is not the inverse of ``observe``; the message names effect and hooks
     """
     sizes = np.array([p.null + p.size_for(Scales()) for p in effect.parameters])
     low, high = np.array([(p.lower, p.upper) for p in effect.parameters]).T
@@ -30,9 +33,12 @@ def try_out(model: mujoco.MjModel, effect: Effect) -> None:
         simulation = Simulation(model, [effect], 1)
         (bound,) = simulation.effects
         motion = simulation.rollout(values, qpos, qvel, drive)
+        alone = [simulation.rollout(values[[i]], qpos[[i]], qvel[[i]], drive.take(np.array([i]))) for i in range(N)]
         sent = bound.command(np.zeros(N), values, {}, model.opt.timestep)  # MuJoCo takes one that is no number for 0
-        seen = bound.observe(np.zeros((N, STEPS)), np.zeros((N, STEPS)), values[:, None])
-        made = (*motion, sent, bound.late(values), *seen, *bound.unobserve(*seen, values[:, None]))
+        true = np.tile(np.linspace(-1.0, 1.0, 5), (N, 1)), np.tile(np.linspace(0.0, SPEED, 5), (N, 1))
+        seen = bound.observe(*true, values[:, None])
+        undone = bound.unobserve(*seen, values[:, None])
+        made = (*motion, sent, bound.late(values), *seen, *undone)
         finite = all(np.isfinite(array).all() for array in made)
     except Exception as error:  # whatever somebody's code raises
         raise ValueError(
@@ -43,4 +49,16 @@ def try_out(model: mujoco.MjModel, effect: Effect) -> None:
         raise ValueError(
             f"{effect.label}: what {hooks} makes of plausible parameters is not finite, at the model's zero pose, at "
             f"rest or at speeds up to {SPEED} rad/s or m/s; mind what it divides by there"
+        )
+    together = (np.concatenate(parts) for parts in zip(*alone))
+    if not all(np.allclose(a, b, rtol=1e-6, atol=1e-9) for a, b in zip(motion, together)):
+        raise ValueError(
+            f"{effect.label}: {hooks} makes something else of a simulation beside others than alone; row i of x, and "
+            "of all arrays, is that of simulation i"
+        )
+    off, shift = (max(np.abs(a - b).max() for a, b in zip(arrays, true)) for arrays in (undone, seen))
+    if off > UNDONE * shift:
+        raise ValueError(
+            f"{effect.label}: unobserve of {type(effect).__name__} does not take back what its observe does: it is "
+            f"off by {off:.3g} where that changes {shift:.3g}; it takes what the sensor shows, and returns q and v"
         )

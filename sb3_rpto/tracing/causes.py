@@ -63,7 +63,7 @@ def residual_of(report: Report, effect: Effect) -> Picture | None:
     dofs = wording.dofs_of(effect, model)
     if not dofs or not report.residuals_before:
         return None
-    dof = max(dofs, key=lambda d: report.force_before[d] - report.force_after[d])
+    dof = max(dofs, key=lambda d: np.nan_to_num(report.force_before[d] - report.force_after[d], nan=-np.inf))
     cause, level = cause_of(effect), effect.kind in LEVELS
     actuator = object_id(model, "actuator", effect.on) if effect.place == "actuator" else None
     panels = [
@@ -80,7 +80,7 @@ def residual_of(report: Report, effect: Effect) -> Picture | None:
         ]
         for axis, (name, found, _) in zip(axes[0], panels):
             axis.set_ylim(min(low for low, _ in bounds), max(high for _, high in bounds))
-            axis.set_title(f"{name}: {summary(found)[dof]:.3g} {unit} RMS")
+            axis.set_title(f"{name}: {wording.number(summary(found)[dof], 3)} {unit} RMS")
 
     sign = ", times the direction of motion (below zero it brakes)" if level else ""
     caption = (
@@ -91,7 +91,7 @@ def residual_of(report: Report, effect: Effect) -> Picture | None:
     )
     title = (
         f"{effect.label}: missing force of {wording.dof_name(model, dof)} against {cause}, RMS "
-        f"{report.force_before[dof]:.3g} → {report.force_after[dof]:.3g} {unit}"
+        f"{wording.number(report.force_before[dof], 3)} → {wording.number(report.force_after[dof], 3)} {unit}"
     )
     return Picture(title, draw(1, 3, paint), caption)
 

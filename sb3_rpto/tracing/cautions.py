@@ -308,11 +308,11 @@ def no_nearer(before: Sequence[HorizonError], after: Sequence[HorizonError]) -> 
     pairs = [(b, a) for b, a in zip(before, after) if isinstance(b.horizon, float)]
     if not pairs or not np.mean([np.log(a.rmse / b.rmse).mean() for b, a in pairs]) > np.log(1 + WORSE):
         return []
-    b, a = pairs[-1]
+    b, a = max(pairs, key=lambda pair: float((pair[1].rmse / pair[0].rmse).max()))
     worst = int(np.argmax(a.rmse / b.rmse))
     message = (
-        f"predicted worse with what is listed ({b.joints[worst]}, {b.horizon:g} s: {b.rmse[worst]:.3g} before, "
-        f"{a.rmse[worst]:.3g} after): it stands in for something else; do not use the corrected simulator"
+        f"predicted worse with what is listed (worst for {b.joints[worst]}, {b.horizon:g} s ahead: {b.rmse[worst]:.3g} "
+        f"before, {a.rmse[worst]:.3g} after): it stands in for something else; do not use the corrected simulator"
     )
     return [Finding("no nearer", "test runs", message)]
 

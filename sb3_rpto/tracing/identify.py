@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_rpto.effects import Declared, Scales, Simulation
 from sb3_rpto.tracing.box import bounded_step
-from sb3_rpto.tracing.interpolation import interpolate
+from sb3_rpto.tracing.interpolation import between, interpolate
 from sb3_rpto.tracing.loss import Loss
 from sb3_rpto.tracing.starts import moved, straight
 from sb3_rpto.tracing.windows import Windows
@@ -125,17 +125,18 @@ class Problem:
         qpos, qvel = moved(model, w.qpos[index], shift[:, : model.nv]), w.qvel[index] + shift[:, model.nv :]
         self.simulation.undo_sensors(values, qpos, qvel, w.qacc[index])
         q, v = self.simulation.rollout(values, qpos, qvel, w.drive.take(index))
-        dt, dofs = float(model.opt.timestep), self._dofs()
+        dt, dofs, at = float(model.opt.timestep), self._dofs(), dict.fromkeys(range(len(w.columns)), w.at[index])
         out = interpolate(q, v, w.at[index], dt, w.columns, dofs)
         sensing = self.simulation.sensing(values)
         for effect, x in sensing:
             age = effect.late(x)
             for column in np.flatnonzero(w.columns == effect.adr) if age.any() else ():
-                at = w.at[index] - age[:, None] / dt
-                out[:, :, [column]] = interpolate(q, v, at, dt, w.columns[[column]], dofs[[column]])
+                at[column] = w.at[index] - age[:, None] / dt
+                out[:, :, [column]] = interpolate(q, v, at[column], dt, w.columns[[column]], dofs[[column]])
         for effect, x in sensing:
             for column in np.flatnonzero(w.columns == effect.adr):
-                out[:, :, column] = effect.observe(out[:, :, column], out[:, :, column], x[:, None])[0]
+                speed = between(v[:, :, effect.dof], at[column])
+                out[:, :, column] = effect.observe(out[:, :, column], speed, x[:, None])[0]
         return out
 
     def _dofs(self) -> np.ndarray:

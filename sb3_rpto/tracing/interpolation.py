@@ -31,3 +31,11 @@ def interpolate(
     d0 = np.where(dofs >= 0, dt * v[rows, k][:, :, dofs], slope)
     d1 = np.where(dofs >= 0, dt * v[rows, k + 1][:, :, dofs], slope)
     return q0 + s * (d0 + s * ((3 * slope - 2 * d0 - d1) + s * (d0 + d1 - 2 * slope)))
+
+
+def between(values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values (n, K + 1) at fractional steps (n, S), linearly; before the start those of it."""
+    at = np.maximum(at, 0.0)
+    k = np.minimum(at.astype(int), values.shape[1] - 2)
+    rows, part = np.arange(len(values))[:, None], at - k
+    return np.asarray((1 - part) * values[rows, k] + part * values[rows, k + 1])

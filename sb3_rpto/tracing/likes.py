@@ -9,7 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
-from sb3_rpto.tracing.evidence import GAIN
+from sb3_rpto.tracing.evidence import GAIN, compare
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.select import REFIT, SEEMS, Model, Selection, Selector
@@ -51,6 +51,9 @@ class Likes:
                 if self._better(trial, current):
                     clear = self.selector.evidence(trial, current).clear(*self.selector.limit(trial))
                     current, best, alike = trial, other, [] if clear else [*alike, best]
+                elif self._twins(best, other):
+                    if not self._clearly_worse(trial, current):
+                        alike.append(other)
                 elif not self._better(current, trial):
                     alike.append(other)
                     if self._simpler(other, best):
@@ -188,9 +191,31 @@ class Likes:
         return sorted(near, key=lambda i: self.kinds[i] not in kinds)[:SUBSTITUTES]
 
     def _exchanged(self, model: Model, old: int, new: int) -> Model:
-        """The model with ``new`` in the place of ``old``, fitted."""
-        rest = [i for i in model.effects if i != old]
-        return self.selector.model([*rest, new], self._translated(model, old, new), EXCHANGED)
+        """The model with ``new`` in the place of ``old``, fitted.
+
+        One of the same kind that acts alike is fitted from the same values, too: at a kink, as of dry friction, what is
+        the likest to first order is far from what is.
+        """
+        effects = [*(i for i in model.effects if i != old), new]
+        found = self.selector.model(effects, self._translated(model, old, new), EXCHANGED)
+        if self._twins(old, new) and found.fit.cost > model.fit.cost:
+            slices, values = self.selector.simulation.slices, model.fit.values.copy()
+            values[slices[new]] = values[slices[old]]
+            return self.selector.anew(effects, replace(model.fit, values=values, linear=None), EXCHANGED)
+        return found
+
+    def _twins(self, a: int, b: int) -> bool:
+        """Whether two are of one kind and act alike, as friction at either end of a linkage."""
+        return self.kinds[a] == self.kinds[b] and b in self.screening.alike(a)
+
+    def _clearly_worse(self, twin: Model, model: Model) -> bool:
+        """Whether a twin in place of an effect fits clearly worse, by the fitted windows: it has as many parameters.
+
+        What windows err by that were not fitted is known to first order, and at a kink by less than tells twins apart.
+        """
+        train = self.selector.train
+        gained = compare(twin.fit.errors, model.fit.errors, train.windows.block, rare=not train.exact)
+        return gained.clear(*self.selector.limit(model))
 
     def _translated(self, model: Model, old: int, new: int) -> Fit:
         """Where to begin with ``new`` in the place of ``old``: where it does the likest, to first order."""

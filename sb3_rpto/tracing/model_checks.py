@@ -147,6 +147,18 @@ def soft_ties(model: mujoco.MjModel) -> list[Finding]:
     return found
 
 
+def carried(model: mujoco.MjModel) -> list[Finding]:
+    """Bodies whose weight the model carries: MuJoCo carries that of what is added to them, too."""
+    names = object_names(model, "body")
+    bodies = [names[i] for i in np.flatnonzero(model.body_gravcomp * model.body_mass)]
+    message = (
+        "the model carries its weight (gravcomp), as much as it has: a payload or another mass has inertia there and "
+        "no weight, and is hardly found. A controller carries what it was told: take gravcomp out of the model, and "
+        "give what the motors put out, the controller's part with it, as the commands"
+    )
+    return [Finding("gravity compensation", f"body {', '.join(bodies)}", message)] if bodies else []
+
+
 def check_clock(model: mujoco.MjModel, data: Measurements) -> None:
     """Refuse samples so far apart, or so near to each other, that their times can hardly be in seconds.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 from scipy.signal import butter, filtfilt
 
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation
@@ -104,7 +105,7 @@ def _stopped(model: mujoco.MjModel, shown: np.ndarray, around: int) -> np.ndarra
         dof, (low, high) = model.jnt_dofadr[joint], model.jnt_range[joint]
         if model.jnt_type[joint] in SCALAR_JOINTS:
             beyond = (shown[:, dof] <= low) | (shown[:, dof] >= high)
-            stopped[:, dof] = np.convolve(beyond, np.ones(2 * around + 1), "same") > 0.5
+            stopped[:, dof] = maximum_filter1d(beyond, 2 * around + 1, mode="constant")
     return stopped
 
 
@@ -290,12 +291,15 @@ def typical(simulation: Simulation, residuals: list[ForceResidual]) -> Typical:
 
 
 def summary(residuals: list[ForceResidual]) -> np.ndarray:
-    """Root mean squared force residual of each degree of freedom away from rest and its limits, (nv,)."""
+    """Root mean squared force residual of each degree of freedom away from rest and its limits, (nv,).
+
+    NaN where it is nowhere else.
+    """
     force = np.concatenate([r.force for r in residuals])
     speed = np.abs(np.concatenate([r.qvel for r in residuals]))
     moving = speed > REST * np.quantile(speed, 0.95, axis=0)
     moving &= np.concatenate([np.ones_like(r.force, bool) if r.stopped is None else ~r.stopped for r in residuals])
-    return np.array([np.sqrt(np.mean(f[m] ** 2)) if m.any() else 0.0 for f, m in zip(force.T, moving.T)])
+    return np.array([np.sqrt(np.mean(f[m] ** 2)) if m.any() else np.nan for f, m in zip(force.T, moving.T)])
 
 
 def learnable_share(residuals: list[ForceResidual], seed: int, filtered: bool = True) -> np.ndarray:

@@ -238,6 +238,17 @@ def test_the_newest_transitions_are_fitted():
     assert model.values[0] == pytest.approx(0.07, abs=1e-6)
 
 
+@pytest.mark.parametrize(("bounds", "ends_at"), [("", 40.0), ("=0.5:10", 10.0)])
+def test_a_number_that_is_far_off_is_on_its_way_and_not_unseen(bounds, ends_at):
+    data = collect(shifted(POLE, {"slider.damping": 40.0}), 100)
+    model = dynamics(POLE, ["slider.damping" + bounds])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # that the data do not show it, say
+        for _ in range(6):
+            model.fit(data)
+    assert model.values == pytest.approx([ends_at], rel=1e-6)
+
+
 def test_what_the_data_do_not_show_is_named_once_and_stays(pole):
     model = dynamics(POLE, ["pole.mass", "cart.friction"])
     nominal = model.values

@@ -167,6 +167,7 @@ def test_what_is_declared_is_left_out(declared: str, gone: set[str]) -> None:
         ("servo.kp", {"servo_gain(servo)"}),
         ("servo.kv", {"servo_damping(servo)"}),
         ("servo.strength", {"servo_gain(servo)", "command_gain(servo)"}),  # beside it one of the two gains is free
+        ("drive.kv", {"velocity_servo_gain(drive)"}),
         ("floor.timeconst", {"contact_softness(floor)"}),
         ("floor.dampratio", {"contact_softness(floor)"}),
     ],
@@ -174,7 +175,8 @@ def test_what_is_declared_is_left_out(declared: str, gone: set[str]) -> None:
 def test_gains_of_a_servo_and_contacts_that_are_declared_are_left_out(declared: str, gone: set[str]) -> None:
     compiled = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/>
     <body><joint name="hinge"/><geom size=".1"/></body></worldbody>
-    <actuator><position name="servo" joint="hinge" kp="9" kv="1"/></actuator></mujoco>""")
+    <actuator><position name="servo" joint="hinge" kp="9" kv="1"/>
+    <velocity name="drive" joint="hinge" kv="2"/></actuator></mujoco>""")
     every = {e.label for e in candidates(compiled, kinds=LIBRARY)}
     assert every - {e.label for e in candidates(compiled, [declared], LIBRARY)} == gone
 
@@ -223,6 +225,9 @@ def test_a_users_effect_is_offered_and_acts(cubic: type[Effect]) -> None:
         ("parameters", (), r"parameters is \(\); give a tuple of Parameter"),
         ("parameters", ("a",), "give a tuple of Parameter"),
         ("act", Effect.act, "Ticking does nothing; override one of write, act"),
+        ("observe", lambda self, q, v, x: (q + x[..., 0], v), "observe and its inverse, unobserve, go together"),
+        ("parameters", (Parameter("c", "", 0.1), Parameter("c", "", 0.1)), "have the names c, c; give each its own"),
+        ("parameters", (Parameter("c", "", 0),), "size of c is 0; give a plausible small one"),
     ],
 )
 def test_a_class_that_would_fail_in_the_middle_of_a_trace_is_refused(
@@ -266,6 +271,35 @@ def test_a_hook_that_makes_no_numbers_is_named_before_a_search(hook: str) -> Non
     wrong = type("Wrong", (Effect,), {**own, hook: nothing_over_nothing})
     compiled = model()
     with pytest.raises(ValueError, match=rf"no_number\(\w+\): what {hook} of Wrong makes .* is not finite.*at rest"):
+        try_out(compiled, wrong(wrong.places(compiled)[0]))
+
+
+def first_row_alone(self: Effect, world: Any, x: np.ndarray) -> None:
+    world.force[:, self.dof] -= x[0, 0] * world.qvel[:, self.dof]
+
+
+@pytest.mark.parametrize(
+    ("hooks", "message"),
+    [
+        ({"act": first_row_alone}, r"act of Wrong makes something else of a simulation beside others than alone"),
+        (
+            {"observe": lambda self, q, v, x: (q + x[..., 0] * v + x[..., 0], v), "unobserve": Effect.unobserve},
+            r"unobserve of Wrong does not take back what its observe does",
+        ),
+        (
+            {
+                "observe": lambda self, q, v, x: (q + x[..., 0] * v, v),
+                "unobserve": lambda self, q, v, x: (q + x[..., 0] * v, v),
+            },
+            r"unobserve of Wrong does not take back what its observe does",
+        ),
+    ],
+)
+def test_simulations_that_are_mixed_and_inverses_that_are_none_are_named(hooks: dict[str, Any], message: str) -> None:
+    place = "joint" if "act" in hooks else "sensor"
+    own = {"kind": "wrong", "place": place, "parameters": (Parameter("strength", "N·m", 0.1),), "equation": ""}
+    wrong, compiled = type("Wrong", (Effect,), {**own, **hooks}), model()
+    with pytest.raises(ValueError, match=message):
         try_out(compiled, wrong(wrong.places(compiled)[0]))
 
 

@@ -44,7 +44,9 @@ ARM = """
 </mujoco>
 """
 PLAIN = ARM % ("", "")
-LOOSE = PLAIN.replace('<joint name="shoulder"', '<joint name="lift" type="slide" axis="0 0 1"/><joint name="shoulder"')
+LOOSE = PLAIN.replace(
+    '<joint name="shoulder"', '<joint name="lift" type="slide" axis="0 0 1"/><joint name="shoulder"'
+).replace("</actuator>", '<velocity name="drive" joint="lift" kv="2"/></actuator>')
 TETRAHEDRON = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
 MESHED = (ARM % ('<mesh name="tip" file="tip.obj"/>', '<geom type="mesh" mesh="tip" pos=".3 0 0"/>')).replace(
     "<compiler ", '<compiler meshdir="parts" '

@@ -218,6 +218,7 @@ ROWS = {
     "command_gain": Row("shoulder_motor", {"change": -0.15}, {"change": 0.0}),
     "servo_gain": Row("servo", {"change": -0.2}, {"change": 0.1}, model=SERVOS),
     "servo_damping": Row("servo", {"change": -0.4}, {"change": 0.1}, model=SERVOS),
+    "velocity_servo_gain": Row("speed", {"change": -0.3}, {"change": 0.1}, model=SERVOS),
     "command_saturation": Row("shoulder_motor", {"inverse_limit": 1.6}, {"inverse_limit": 1.2}),
     "backlash": Row("elbow_motor", {"half_width": 0.15}, {"half_width": 0.05}),
     "actuator_lag": Row("shoulder_motor", {"time_constant": 0.05}, {"time_constant": 0.01}),
@@ -588,6 +589,15 @@ def test_a_servos_gains_are_its_kp_and_kv() -> None:
     got = one_step(SERVOS, [LIBRARY[name]("servo", change=change) for name, change in zip(names, (-0.25, -0.5))])
     np.testing.assert_array_equal(got, one_step(edited(SERVOS, softer), []))
     assert not np.allclose(got, one_step(SERVOS, []))
+
+
+def test_a_velocity_servos_gain_is_its_kv() -> None:
+    def weaker(m: mujoco.MjModel) -> None:
+        m.actuator_gainprm[1, 0], m.actuator_biasprm[1, 2] = 0.25, -0.25
+
+    assert LIBRARY["velocity_servo_gain"].places(SERVOS) == ["speed"]
+    got = one_step(SERVOS, [LIBRARY["velocity_servo_gain"]("speed", change=-0.5)])
+    np.testing.assert_array_equal(got, one_step(edited(SERVOS, weaker), []))
 
 
 def test_tilt_turns_gravity() -> None:

@@ -142,7 +142,8 @@ def test_it_steps_as_the_batch_does(kind):
     if kind and not LIBRARY[kind].places(env.unwrapped.model):
         env = in_touch("Reacher-v5")  # its target moves in two ways
         model = env.unwrapped.model  # and its motors shall be servos
-        model.actuator_biastype[:], model.actuator_biasprm[:, 1:3] = mujoco.mjtBias.mjBIAS_AFFINE, (-1, -0.1)
+        back = (0, -1) if kind.startswith("velocity") else (-1, -0.1)
+        model.actuator_biastype[:], model.actuator_biasprm[:, 1:3] = mujoco.mjtBias.mjBIAS_AFFINE, back
         model.actuator_gear[:, 0] = 4
     base = env.unwrapped
     nominal = copy.copy(base.model)

@@ -75,7 +75,10 @@ def test_what_explains_nothing_and_predicts_worse_is_told() -> None:
     worse = replace(ERROR, rmse=np.array([1.4e-3, 3e-3]))
     whole = replace(ERROR, horizon="whole run", rmse=np.array([1e-9, 1e-9]))  # of a few runs: chance
     (found,) = no_nearer([ERROR, replace(ERROR, horizon="whole run")], [worse, whole])
-    assert "worse with what is listed (b, 0.5 s: 0.001 before, 0.003 after)" in found.message
+    assert "worse with what is listed (worst for b, 0.5 s ahead: 0.001 before, 0.003 after)" in found.message
+    soon, late = replace(ERROR, horizon=0.1), replace(ERROR, horizon=1.0)  # much worse soon, somewhat better late
+    (found,) = no_nearer([soon, late], [replace(soon, rmse=3 * soon.rmse), replace(late, rmse=0.8 * late.rmse)])
+    assert "0.1 s ahead" in found.message
     assert no_nearer([ERROR], [replace(ERROR, rmse=1.04 * ERROR.rmse)]) == []  # a trifle
     assert no_nearer([worse], [ERROR]) == no_nearer([whole], [worse]) == no_nearer([], []) == []
 

@@ -150,6 +150,26 @@ def test_a_sensors_bias_shifts_the_start_and_what_is_shown_alike() -> None:
     assert np.median(right) < 0.1 * np.median(wrong)
 
 
+def test_a_sensor_of_ones_own_is_given_the_velocity() -> None:
+    class Filtered(Effect):
+        """An encoder behind a quick filter, to first order."""
+
+        kind, place, equation = "filtered", "sensor", "q - T qd"
+        parameters = (Parameter("T", "s", 0.005, lower=0.0),)
+
+        def observe(self, q, v, x):
+            return q - x[..., 0] * v, v
+
+        def unobserve(self, q, v, x):
+            return q + x[..., 0] * v, v
+
+    data = recorded(noise=0.0)
+    shown = [replace(e, qpos=e.qpos - 0.02 * e.qvel) for e in data.episodes]
+    p = problem([Filtered("hinge")], replace(data, episodes=shown))
+    errors = [np.median(p.score(np.array([lag]), iterations=3).errors) for lag in (0.0, 0.02)]
+    assert errors[1] < 0.1 < 1 < errors[0]
+
+
 @pytest.mark.parametrize("bias_first", [True, False])
 def test_bias_and_gain_of_one_sensor_are_undone_in_the_opposite_order(bias_first: bool) -> None:
     pair = [SensorBias("hinge", offset=0.3), SensorGain("hinge", change=0.2)][:: 1 if bias_first else -1]

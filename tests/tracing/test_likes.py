@@ -1,11 +1,12 @@
 """Exchanges of effects that could stand for one another, on small problems with a known answer."""
 
 import pytest
-from simulated import compiled, problem, recorded
+from simulated import compiled, problem, recorded, torques
 
 from sb3_rpto.effects.commands import ActuatorLag, CommandDelay
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.friction import CoulombFriction, SoftFriction, StribeckFriction, ViscousFriction
+from sb3_rpto.tracing import trace
 from sb3_rpto.tracing.likes import Likes
 from sb3_rpto.tracing.screen import screen
 from sb3_rpto.tracing.select import THRESHOLD, Selection, Selector
@@ -33,6 +34,29 @@ def test_what_does_as_well_is_of_the_class() -> None:
     found = Likes(s, screen(train, nothing)).substitute(Selection(s.model([0], nothing, 12)))
     (kept,) = found.model.effects
     assert found.alike[kept] == [1 - kept]
+
+
+FOUR_BAR = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<body name="crank"><joint name="a" axis="0 -1 0" damping=".02"/><geom type="capsule" fromto="0 0 0 0 0 .3" size=".02"
+ mass=".3" contype="0" conaffinity="0"/><body name="coupler" pos="0 0 .3"><joint name="b" axis="0 -1 0" damping=".01"/>
+ <geom type="capsule" fromto="0 0 0 .6 0 0" size=".02" mass=".4" contype="0" conaffinity="0"/></body></body>
+<body name="rocker" pos=".6 0 0"><joint name="c" axis="0 -1 0" damping=".02"/><geom type="capsule" fromto="0 0 0 0 0 .3"
+ size=".02" mass=".3" contype="0" conaffinity="0"/></body></worldbody>
+<equality><connect body1="coupler" body2="rocker" anchor=".6 0 0" solref="0.004 1"
+ solimp="0.99 0.999 0.0001"/></equality>
+<actuator><position name="servo" joint="a" kp="20" kv="1"/></actuator></mujoco>"""
+
+
+@pytest.mark.slow
+def test_joints_of_a_linkage_that_turn_alike_are_one_class() -> None:
+    """What is the likest to first order is far from what is, as friction has a kink."""
+    commands = torques(4, 250, 1, size=0.9, rate=100)
+    finely = compiled(FOUR_BAR.replace('"0.002"', '"0.0002"'))
+    planted = [CoulombFriction("a", level=0.3)]
+    data = recorded(planted, finely, start=[0, 0], rate=100, commands=commands, duration=2.5)
+    report = trace(FOUR_BAR, data, candidates=["coulomb_friction"], threads=1)
+    (named,) = report.effects
+    assert {named.effect.on, *(label[-2] for label in named.alike)} == {"a", "b", "c"}
 
 
 def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:

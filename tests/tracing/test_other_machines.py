@@ -244,3 +244,14 @@ def test_a_test_run_too_short_for_inverse_dynamics_is_reported_without_a_missing
 def test_arguments_out_of_range_are_refused_by_name(argument: dict, message: str) -> None:
     with pytest.raises((ValueError, TypeError), match=message):
         trace(PENDULUM, recorded(), **argument)
+
+
+@pytest.mark.slow
+def test_a_velocity_servo_of_another_gain_is_no_payload() -> None:
+    xml = machine('<velocity name="motor" joint="hinge" kv="{}"/>', 'damping="0.02"')
+    kinds = ("velocity_servo_gain", "command_gain", "viscous_friction", "coulomb_friction", "actuator_lag", "payload")
+    report = trace(xml.format(1), steps(xml.format(0.7), size=4.0), candidates=kinds, threads=1)
+    assert report.verdict == "explained"
+    (found,) = report.effects
+    assert found.label == "velocity_servo_gain(motor)"
+    assert found.effect.values == pytest.approx([-0.3], abs=0.003)

@@ -275,3 +275,21 @@ def test_the_summary_leaves_rest_out() -> None:
     rest = ForceResidual("a", *[np.zeros((10, 1))] * 5, np.full((10, 1), 100.0))
     moving = ForceResidual("b", *[np.ones((40, 1))] * 5, np.full((40, 1), -2.0))
     assert summary([rest, moving]) == pytest.approx([2.0])
+
+
+def test_the_summary_of_a_joint_that_is_always_at_its_limit_is_not_known() -> None:
+    stopped = ForceResidual("a", *[np.ones((40, 1))] * 6, False, np.ones((40, 1), bool))
+    assert np.isnan(summary([stopped])).all()
+
+
+def test_a_run_shorter_than_the_filter_is_taken() -> None:
+    limited = compiled(PENDULUM.replace('name="hinge"', 'name="hinge" limited="true" range="-170 170"'))
+    data = recorded(model=limited, episodes=2)
+    long, short = data.episodes
+    names = ("time", "qpos", "qvel", "ctrl", "enabled", "usable", "placed")
+    brief = replace(short, **{name: getattr(short, name)[:8] for name in names if getattr(short, name) is not None})
+    data = replace(data, episodes=[long, brief])
+    simulation = Simulation(limited, [], 1)
+    for found in force_residuals(simulation, simulation.values(), data):
+        assert found.stopped is not None
+        assert found.stopped.shape == found.qvel.shape

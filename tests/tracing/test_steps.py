@@ -6,7 +6,7 @@ import pytest
 from simulated import briefly
 
 from sb3_rpto.tracing import Measurements, trace
-from sb3_rpto.tracing.model_checks import soft_friction, soft_ties
+from sb3_rpto.tracing.model_checks import carried, soft_friction, soft_ties
 from sb3_rpto.tracing.prepare import SetUp
 
 CRANK = """
@@ -64,6 +64,13 @@ def test_friction_that_creeps_is_said_to() -> None:
     model = mujoco.MjModel.from_xml_string(CRANK.format(friction='frictionloss="0.1"'))
     assert [f.where for f in soft_friction(model)] == ["joint crank"]
     assert not soft_friction(mujoco.MjModel.from_xml_string(CRANK.format(friction="")))
+
+
+def test_bodies_whose_weight_the_model_carries_are_said_to_be() -> None:
+    arm = """<mujoco><worldbody><body name="link" gravcomp="{}"><joint name="a"/><geom size="0.1"/></body></worldbody>
+    </mujoco>"""
+    assert [f.where for f in carried(mujoco.MjModel.from_xml_string(arm.format(1)))] == ["body link"]
+    assert not carried(mujoco.MjModel.from_xml_string(arm.format(0)))
 
 
 def test_ties_that_give_way_are_said_to() -> None:
