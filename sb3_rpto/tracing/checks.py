@@ -78,13 +78,15 @@ def split_at_gaps(time: np.ndarray) -> list[slice]:
 
 
 def jitter(time: np.ndarray) -> float:
-    """Relative jitter of the clock: 95 % of the steps lie within this fraction of the median step.
+    """Relative jitter of the clock: 95 % of the steps lie within this fraction of the median step around a tick of it.
+
+    Rows that are missing are no jitter.
 
     :param time: increasing times in s, shape (T,) with T >= 2
     """
-    steps = np.diff(time)
-    median = float(np.median(steps))
-    return float(np.quantile(np.abs(steps - median), 0.95)) / median
+    steps = np.diff(time) / np.median(np.diff(time))
+    ticks = np.where(steps <= GAP, np.maximum(np.round(steps), 1), 1)
+    return float(np.quantile(np.abs(steps - ticks), 0.95))
 
 
 def missing(time: np.ndarray) -> int:

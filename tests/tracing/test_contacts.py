@@ -56,6 +56,42 @@ def test_touch_downs_and_lift_offs_are_counted(heights: tuple[float, float], cha
     assert contact_changes(mujoco.MjModel.from_xml_string(LEG), data) == pytest.approx(changes / 0.9)
 
 
+def test_what_lies_on_the_floor_touches_it_all_the_time() -> None:
+    height = -0.15 + 1e-3 * np.random.default_rng(0).standard_normal(200)
+    table = {"time": np.arange(200) / 100, "qpos.height": height, "qpos.knee": 0 * height, "ctrl.thrust": 0 * height}
+    model = mujoco.MjModel.from_xml_string(LEG)
+    assert contact_changes(model, Measurements.from_tables({"run": table})) < 0.5
+    assert not model.geom_margin.any()
+
+
+BOX = """<mujoco><option timestep="0.002" cone="elliptic" impratio="10"/><worldbody>
+<geom name="floor" type="plane" size="20 20 .1" friction="{} .005 .0001"/><body pos="0 0 .1">
+<joint name="along" type="slide" axis="1 0 0"/><joint name="up" type="slide" axis="0 0 1"/>
+<geom type="box" size=".1 .1 .1" mass="1" friction=".1 .005 .0001"/></body></worldbody>
+<actuator><motor name="push" joint="along"/></actuator></mujoco>"""
+
+
+@pytest.mark.slow
+def test_the_friction_of_what_slides_is_found_in_windows_of_the_usual_length() -> None:
+    model, tables = mujoco.MjModel.from_xml_string(BOX.format(0.55)), {}
+    model.opt.timestep = 5e-4
+    for run in range(4):
+        rng, data, path = np.random.default_rng(run), mujoco.MjData(model), []
+        told = 9 * np.repeat(rng.uniform(-1, 1, 9), 30)[:250]
+        for command in told:
+            path.append(data.qpos.copy())
+            data.ctrl[:] = command
+            mujoco.mj_step(model, data, 20)
+        along, up = (np.array(path) + 1e-3 * rng.standard_normal((250, 2))).T
+        tables[f"run{run}"] = {"time": np.arange(250) / 100, "qpos.along": along, "qpos.up": up, "ctrl.push": told}
+    kinds = ["geom_friction", "viscous_friction", "coulomb_friction"]
+    report = trace(BOX.format(0.5), Measurements.from_tables(tables), candidates=kinds, threads=1)
+    assert report.verdict == "explained"
+    (found,) = report.effects
+    assert found.label == "geom_friction(floor)"
+    assert found.effect.values == pytest.approx([0.05], abs=0.005)
+
+
 @pytest.mark.parametrize(("jump", "low", "high"), [(0.0, 1.0, 1.8), (5.0, 4.0, 8.0)])
 def test_a_smoothed_start_is_less_certain_where_a_velocity_jumps(jump: float, low: float, high: float) -> None:
     """Nine samples 5 ms apart about a jump by 5 m/s: a cubic misses them by 6 mm (RMS), the noise is 1 mm."""

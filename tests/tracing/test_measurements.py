@@ -317,6 +317,13 @@ def test_splitting_at_gaps_loses_no_sample(steps):
     assert all(time[b.start] - time[b.start - 1] > limit for b in slices[1:])
 
 
+def test_many_missing_rows_are_no_jitter():
+    table = swing(n=300)
+    kept = np.random.default_rng(0).uniform(size=300) > 0.1
+    found = Measurements.from_tables({"a": {name: column[kept] for name, column in table.items()}}).findings
+    assert {f.kind for f in found} == {"missing rows"}
+
+
 def test_jitter_is_reported():
     time = np.arange(200) * 0.01 + np.random.default_rng(0).uniform(-0.002, 0.002, 200)
     table = {"time": time, "qpos.hinge": np.sin(time), "qvel.hinge": np.cos(time)}
