@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -25,8 +24,9 @@ DIFFERENCES = (1e-2, 1e-3, 1e-4)
 #: Shares of the trusted size that a step may have.
 REACHES = 0.25 ** np.arange(5)
 #: A parameter that moves no residual by this share of the typical one, for a change by its scale, is not identified,
-#: nor is one whose standard error is more than this many of its scales.
-UNSEEN, VAGUE = 1e-3, 1.0
+#: nor is one whose standard error is more than this many of its scales (or times what it was), unless it is so many
+#: standard errors from what it was.
+UNSEEN, VAGUE, CLEARLY = 1e-3, 1.0, 3.0
 #: Scores of so many transitions in a row may be correlated.
 LAGS = 4
 #: Weight, relative to the data's, of the wish that a step be small.
@@ -266,38 +266,40 @@ class OneStep:
         errs ends one transition and begins the next, and what the simulator lacks lasts longer than a transition.
         Of what the transitions do not show or tell apart the variance is infinite, and the rest of its row zero.
         """
-        told = self._covariance(*self._curvature(values), ~self.held & ~self.left) * np.outer(self.scale, self.scale)
+        here = self.linearise(values, DIFFERENCES[1])
+        told = self._covariance(*self._curvature(*here), ~self.held & ~self.left) * np.outer(self.scale, self.scale)
         unknown = self.unseen | self.entangled
         told[unknown] = told[:, unknown] = 0.0
         told[unknown, unknown] = np.inf
         return told
 
-    def vague(self, values: np.ndarray) -> np.ndarray:
+    def vague(self, values: np.ndarray, begin: np.ndarray) -> np.ndarray:
         """Parameters that the transitions show, if at all, too faintly to tell: :data:`VAGUE`; (p,).
 
         One after the other, the vaguest first: of two that act almost alike the other may be told given the one.
-        Judged where a whole step would lead: what phi still has to go for is no noise.
+        Judged where a whole step would lead, as what phi still has to go for is no noise. One that is clearly not what
+        it was is told, however roughly.
+
+        :param values: phi, (p,)
+        :param begin: phi before, where what is vague stays, (p,)
         """
-        free = ~self.held & ~self.left & ~self.unseen
-        curvature = self._curvature(values, np.flatnonzero(free))
-        found = self.unseen.copy()
+        residual, slopes = self.linearise(values, DIFFERENCES[1])
+        free, found = ~self.held & ~self.left & ~self.unseen, self.unseen.copy()
         while free.any():
+            step = np.zeros(len(values))
+            step[free] = np.linalg.lstsq(*_ridged(*self._weighted(residual, slopes[:, :, free])))[0]
+            curvature = self._curvature(residual + slopes @ step, slopes)
             spread = np.where(free, np.sqrt(np.diag(self._covariance(*curvature, free))), 0.0)
-            worst = int(np.argmax(spread))
-            if not spread[worst] > VAGUE:
+            told = np.abs((values - begin) / self.scale + step) > CLEARLY * spread
+            faint = np.where(told, 0.0, spread / np.maximum(1.0, np.abs(begin) / self.scale))
+            worst = int(np.argmax(faint))
+            if not faint[worst] > VAGUE:
                 break
             free[worst], found[worst] = False, True
         return found
 
-    def _curvature(self, values: np.ndarray, gone: Sequence[int] | np.ndarray = ()) -> tuple[np.ndarray, np.ndarray]:
-        """Of the cost at phi, in scales: about its Hessian (p, p), and each transition's part of its slope (n, p).
-
-        :param gone: parameters whose whole linear step the residuals are taken after
-        """
-        residual, slopes = self.linearise(values, DIFFERENCES[1])
-        if len(gone):
-            a, b = self._weighted(residual, slopes[:, :, gone])
-            residual = residual + slopes[:, :, gone] @ np.linalg.lstsq(*_ridged(a, b))[0]
+    def _curvature(self, residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of the cost, in scales: about its Hessian (p, p), and each transition's part of its slope (n, p)."""
         # The loss's own second derivative: the least squares that stand for it in a step curve more.
         curved = self.share[:, None] * (1 + (residual / self.clip) ** 2) ** -1.5
         hessian = np.einsum("nc,ncp,ncq->pq", curved, slopes, slopes)

@@ -378,11 +378,11 @@ class PhysicalDynamics(Dynamics):
         problem = OneStep(self.simulation, self.scale, self.simulation.lower, self.simulation.upper, steps, weights)
         problem.hold_what_is_not_determined(begin)
         values, taken = self._descend(problem, begin, most)
-        vague = problem.vague(values)
+        vague = problem.vague(values, begin)
         while (values != begin)[vague].any():  # what the data do not tell has moved: without it, from the start
             problem.left |= vague
             values, taken = self._descend(problem, begin, most)
-            vague = problem.vague(values)
+            vague = problem.vague(values, begin)
         self._values.copy_(th.as_tensor(values))
         if taken and not self.runs_on(data):
             self._values.copy_(th.as_tensor(begin))

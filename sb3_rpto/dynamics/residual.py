@@ -219,13 +219,13 @@ class ResidualDynamics(Dynamics):
         before = _rms(missed[held].clamp(-reach, reach) / scale)
         worth = before > NEGLIGIBLE
         correction = th.zeros_like(missed[held])
-        if worth.any():
+        shares = None if weights is None else weights[usable][train]
+        if worth.any() and (shares is None or shares.any()):  # else nothing that counts is left to learn from
             nothing = th.zeros_like(missed[:, 0])
             wanted = observations + th.where(worth, missed.clamp(-reach, reach), 0.0)
             examples = Transitions(observations, data.actions.double(), nothing, wanted, nothing)
             # The residual shrinks while phi is fitted, and its scaler must follow; the holdout judges the jump.
             self.ensemble.fitted.fill_(False)
-            shares = None if weights is None else weights[usable][train]
             self.ensemble.fit_rows(examples.take(train), usable[train], shares, max_steps)
             correction = self._correction(observations[held], data.actions[held], deterministic=True)
             after = _rms((missed[held] - correction).clamp(-reach, reach) / scale)

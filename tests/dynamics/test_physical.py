@@ -249,6 +249,20 @@ def test_a_number_that_is_far_off_is_on_its_way_and_not_unseen(bounds, ends_at):
     assert model.values == pytest.approx([ends_at], rel=1e-6)
 
 
+def test_a_number_that_is_roughly_told_to_be_far_off_is_fitted():
+    """To a tenth of itself, which is three times what it was."""
+    data = noisy(collect(shifted(POLES, {"slider.damping": 1.5}), 100, scale=0.3), 3e-3)
+    model = dynamics(POLES, ["slider.damping", "hinge.damping", "cart.mass"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(8):
+            model.fit(data)
+    nominal = np.array([0.05, gym.make(POLES).unwrapped.model.body("cart").mass[0]])
+    off = (model.values - [1.5, *nominal]) / model.deviation
+    assert np.abs(off).max() < 3
+    assert 0.05 < model.deviation[0] < 0.5
+
+
 def test_what_the_data_do_not_show_is_named_once_and_stays(pole):
     model = dynamics(POLE, ["pole.mass", "cart.friction"])
     nominal = model.values

@@ -271,6 +271,17 @@ def test_weights_and_caps_reach_both_parts(data, monkeypatch):
     assert th.equal(trained, weights[:320])
 
 
+def test_weights_that_leave_nothing_to_train_on_fit_phi_alone(data):
+    dynamics, alone = make(), make()
+    weights = th.zeros(len(data))
+    weights[-60:] = 1  # the newest, which are held out
+    log = dynamics.fit(data, weights)
+    alone.physical.fit(data, weights)
+    assert th.equal(dynamics.physical._values, alone.physical._values)
+    assert log["residual_on"] == 0
+    assert log["combined_error"] == log["physical_error"]
+
+
 def test_what_was_trained_on_is_not_held_out_when_the_window_moves_on(data, monkeypatch):
     monkeypatch.setattr("sb3_rpto.dynamics.residual.MAX_TRANSITIONS", 150)
     dynamics, masks = make(), []
