@@ -306,12 +306,20 @@ class OneStep:
         return hessian, np.einsum("nc,ncp,nc->np", self.robust(residual), slopes, residual)
 
     def _covariance(self, hessian: np.ndarray, scores: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """Covariance in scales where only the ``free`` ones move; infinite variances for others and without slope."""
+        """Covariance in scales where only the ``free`` ones move; infinite variances for others and without slope.
+
+        Scores are too small by what the fit took up of them: as of so many transitions fewer as there are numbers.
+        Where no more transitions count than there are numbers, nothing tells how far off these are.
+        """
         moving = np.flatnonzero((np.diag(hessian) > 0) & free)
-        inverse = np.linalg.pinv(hessian[np.ix_(moving, moving)], rcond=1e-10, hermitian=True)
         found = np.diag(np.full(len(free), np.inf))
+        count = 1 / np.square(self.share).sum()  # of transitions that weigh alike
+        spare = count - len(moving)
+        if spare <= 0:
+            return found
+        inverse = np.linalg.pinv(hessian[np.ix_(moving, moving)], rcond=1e-10, hermitian=True)
         # Positive in every direction, rounding apart: Newey and West's weights are.
-        found[np.ix_(moving, moving)] = inverse @ self._scatter(scores[:, moving]) @ inverse
+        found[np.ix_(moving, moving)] = inverse @ self._scatter(scores[:, moving]) @ inverse * (count / spare)
         found[moving, moving] = np.maximum(found[moving, moving], 0.0)
         return found
 

@@ -336,6 +336,16 @@ def test_the_curvature_is_the_costs_second_derivative():
     assert scores.sum() == pytest.approx(slope(0.0), rel=0.01)
 
 
+@pytest.mark.parametrize(("n", "factor"), [(4, 4.0), (12, 12 / 9), (3, np.inf), (2, np.inf)])
+def test_covariances_are_those_of_as_many_transitions_less_as_there_are_numbers(n, factor):
+    task = problem(steps_of(collect(shifted(POLES), n), POLES), ["cart.mass", "pole.mass", "pole2.mass"], POLES)
+    scores, every = np.random.default_rng(0).normal(size=(n, 3)), np.ones(3, dtype=bool)
+    found = np.diag(task._covariance(np.eye(3), scores, every))
+    np.testing.assert_allclose(found, factor * np.diag(task._scatter(scores)))
+    task.share = np.where(np.arange(n) < 2, 0.5, 0.0)  # as if there were two
+    assert np.isinf(np.diag(task._covariance(np.eye(3), scores, every))).all()
+
+
 def test_scores_in_a_row_count_together_and_others_alone():
     data = collect(shifted(POLE), 24)
     data.observations[9, 2] = 10.0  # left out
