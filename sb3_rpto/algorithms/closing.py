@@ -25,6 +25,7 @@ from sb3_rpto.tracing import Measurements, Report, trace
 from sb3_rpto.tracing.adequacy import SETTLED
 from sb3_rpto.tracing.contacts import OFTEN, contact_changes
 from sb3_rpto.tracing.prepare import Progress
+from sb3_rpto.tracing.windows import noise_levels
 from sb3_rpto.tracing.zeros import Zeros
 
 if TYPE_CHECKING:
@@ -413,7 +414,8 @@ def horizon_of(measured: Measurements, env: gym.Env) -> float:
     :param env: the source
     """
     base: Any = env.unwrapped
-    return (window(measured, contact_changes(base.model, measured)) - 1) * float(base.dt)
+    changes = contact_changes(base.model, measured, noise_levels(measured))
+    return (window(measured, changes) - 1) * float(base.dt)
 
 
 def window(measured: Measurements, contacts: float) -> int:

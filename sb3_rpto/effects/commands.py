@@ -3,7 +3,7 @@
 A wrong gain comes last of all, in the actuator itself.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -154,17 +154,20 @@ class ServoGain(Effect):
     native = "kp"
     excite = "commands that jump, and loads that the servo gives way to"
     same = ("kp", "strength")
+    #: what such a servo regulates, and where in its bias it takes the gain back
+    regulates: ClassVar[str] = "position"
+    takes_back: ClassVar[int] = 1
 
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
-        """Position servos."""
+        """Servos of that kind."""
         every = super().places(model)
-        return [name for name in every if servo_of(model, object_id(model, "actuator", name)) == "position"]
+        return [name for name in every if servo_of(model, object_id(model, "actuator", name)) == cls.regulates]
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Scale the gain and what it takes back."""
         world.field("actuator_gainprm")[:, self.index, 0] *= 1 + x[:, 0]
-        world.field("actuator_biasprm")[:, self.index, 1] *= 1 + x[:, 0]
+        world.field("actuator_biasprm")[:, self.index, self.takes_back] *= 1 + x[:, 0]
 
 
 @register
@@ -194,30 +197,19 @@ class ServoDamping(Effect):
 
 
 @register
-class VelocityServoGain(Effect):
+class VelocityServoGain(ServoGain):
     r"""A velocity servo of another gain, :math:`(1 + g)\,k_v\,(u - \dot q)`: MuJoCo's ``kv``.
 
     A ``command_gain`` changes what is commanded alone, not how hard the servo holds against a load.
     """
 
     kind = "velocity_servo_gain"
-    place = "actuator"
-    parameters = (Parameter("change", "", 0.03, lower=-0.9, upper=9.0),)
     equation = "(1 + change) kv (u - qd)"
     native = "kv"
     excite = "commands that jump, and loads that slow the servo"
     same = ("kv", "strength")
-
-    @classmethod
-    def places(cls, model: mujoco.MjModel) -> list[str]:
-        """Velocity servos."""
-        every = super().places(model)
-        return [name for name in every if servo_of(model, object_id(model, "actuator", name)) == "velocity"]
-
-    def write(self, world: World, x: np.ndarray) -> None:
-        """Scale the gain and what it takes back."""
-        world.field("actuator_gainprm")[:, self.index, 0] *= 1 + x[:, 0]
-        world.field("actuator_biasprm")[:, self.index, 2] *= 1 + x[:, 0]
+    regulates = "velocity"
+    takes_back = 2
 
 
 @register

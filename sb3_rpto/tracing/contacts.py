@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.windows import names_of, noise_levels
+from sb3_rpto.tracing.windows import names_of
 
 #: Contacts that change this often a second are said to come and go.
 OFTEN = 0.5
@@ -17,16 +17,17 @@ MOST = 5_000
 PARTED, LEAST, FARTHEST = 5.0, 1e-4, 1e-2
 
 
-def contact_changes(model: mujoco.MjModel, data: Measurements) -> float:
+def contact_changes(model: mujoco.MjModel, data: Measurements, sigma: np.ndarray) -> float:
     """How often the set of geoms that touch changes, per second of the recordings, by the poses that were measured.
 
     What lies on the floor touches it all the time, though by noisy poses it is now in it and now above.
 
     :param model: of the machine
     :param data: recordings; joints that they do not show are at their reference
+    :param sigma: noise of each position column, rad or m, (m,)
     """
     addresses, model = names_of(model, data.columns.qpos), model.__copy__()
-    model.geom_margin[:] = model.pair_margin[:] = _apart(model, data, addresses)
+    model.geom_margin[:] = model.pair_margin[:] = _apart(model, addresses, sigma)
     mj = mujoco.MjData(model)
     changes, seconds = 0, 0.0
     for episode in data.episodes:
@@ -46,12 +47,12 @@ def contact_changes(model: mujoco.MjModel, data: Measurements) -> float:
     return changes / seconds if seconds else 0.0
 
 
-def _apart(model: mujoco.MjModel, data: Measurements, addresses: np.ndarray) -> float:
+def _apart(model: mujoco.MjModel, addresses: np.ndarray, sigma: np.ndarray) -> float:
     """Distance in m at which geoms that touched have parted: an angle's noise acts over the model's whole extent."""
     slides = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE]
     lengths = np.isin(addresses, [*slides, *_centres(model)])
-    noise, extent = noise_levels(data), float(model.stat.extent)
-    along, turned = (float(noise[kind].max(initial=0.0)) for kind in (lengths, ~lengths))
+    extent = float(model.stat.extent)
+    along, turned = (float(sigma[kind].max(initial=0.0)) for kind in (lengths, ~lengths))
     return float(np.clip(PARTED * (along + turned * extent), LEAST * extent, FARTHEST * extent))
 
 

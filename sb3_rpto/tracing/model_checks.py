@@ -147,7 +147,7 @@ def soft_ties(model: mujoco.MjModel) -> list[Finding]:
     return found
 
 
-def carried(model: mujoco.MjModel) -> list[Finding]:
+def carried_weights(model: mujoco.MjModel) -> list[Finding]:
     """Bodies whose weight the model carries: MuJoCo carries that of what is added to them, too."""
     names = object_names(model, "body")
     bodies = [names[i] for i in np.flatnonzero(model.body_gravcomp * model.body_mass)]

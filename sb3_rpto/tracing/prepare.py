@@ -22,7 +22,7 @@ from sb3_rpto.envs.steps import odd_step
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.contacts import OFTEN, contact_changes
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.model_checks import carried, check_against, soft_friction, soft_ties
+from sb3_rpto.tracing.model_checks import carried_weights, check_against, soft_friction, soft_ties
 from sb3_rpto.tracing.origin import idle, origin
 from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.search import Selectors
@@ -158,7 +158,7 @@ def prepare(
         message = "never changes, so nothing tells how finely it is measured: it is not compared with predictions"
         findings += [Finding("at rest", f"fitted runs, qpos.{name}", message) for name in resting]
     sigma = noise_levels(fitted)
-    changes = contact_changes(compiled, fitted)
+    changes = contact_changes(compiled, fitted, sigma)
     touching = changes > OFTEN
     length = _horizon(fitted, touching) if horizon is None else float(horizon)
     if touching and horizon is None:
@@ -181,7 +181,7 @@ def prepare(
     nominal = discretised(roomy, fitted, fine=True)
     there = given(nominal, declared, known)
     if seems == "machine" and not data.exact:
-        findings += soft_friction(nominal) + soft_ties(nominal) + carried(nominal)
+        findings += soft_friction(nominal) + soft_ties(nominal) + carried_weights(nominal)
     settings = {Declared(nominal, name, (-np.inf, np.inf)).number: name for name in data.columns.params}
     for one in there:
         if isinstance(one, Declared) and one.number in settings:

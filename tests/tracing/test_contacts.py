@@ -9,6 +9,7 @@ import pytest
 from sb3_rpto.tracing import Measurements, trace
 from sb3_rpto.tracing.contacts import contact_changes
 from sb3_rpto.tracing.starts import misfit
+from sb3_rpto.tracing.windows import noise_levels
 
 LEG = """
 <mujoco>
@@ -53,14 +54,16 @@ def test_touch_downs_and_lift_offs_are_counted(heights: tuple[float, float], cha
     height = np.tile(heights, 5)
     table = {"time": np.arange(10) / 10, "qpos.height": height, "qpos.knee": 0 * height, "ctrl.thrust": 0 * height}
     data = Measurements.from_tables({"run": table})
-    assert contact_changes(mujoco.MjModel.from_xml_string(LEG), data) == pytest.approx(changes / 0.9)
+    assert contact_changes(mujoco.MjModel.from_xml_string(LEG), data, noise_levels(data)) == pytest.approx(
+        changes / 0.9
+    )
 
 
 def test_what_lies_on_the_floor_touches_it_all_the_time() -> None:
     height = -0.15 + 1e-3 * np.random.default_rng(0).standard_normal(200)
     table = {"time": np.arange(200) / 100, "qpos.height": height, "qpos.knee": 0 * height, "ctrl.thrust": 0 * height}
     model = mujoco.MjModel.from_xml_string(LEG)
-    assert contact_changes(model, Measurements.from_tables({"run": table})) < 0.5
+    assert contact_changes(model, Measurements.from_tables({"run": table}), np.array([1e-3, 1e-7])) < 0.5
     assert not model.geom_margin.any()
 
 

@@ -6,7 +6,7 @@ import pytest
 from simulated import briefly
 
 from sb3_rpto.tracing import Measurements, trace
-from sb3_rpto.tracing.model_checks import carried, soft_friction, soft_ties
+from sb3_rpto.tracing.model_checks import carried_weights, soft_friction, soft_ties
 from sb3_rpto.tracing.prepare import SetUp
 
 CRANK = """
@@ -69,8 +69,8 @@ def test_friction_that_creeps_is_said_to() -> None:
 def test_bodies_whose_weight_the_model_carries_are_said_to_be() -> None:
     arm = """<mujoco><worldbody><body name="link" gravcomp="{}"><joint name="a"/><geom size="0.1"/></body></worldbody>
     </mujoco>"""
-    assert [f.where for f in carried(mujoco.MjModel.from_xml_string(arm.format(1)))] == ["body link"]
-    assert not carried(mujoco.MjModel.from_xml_string(arm.format(0)))
+    assert [f.where for f in carried_weights(mujoco.MjModel.from_xml_string(arm.format(1)))] == ["body link"]
+    assert not carried_weights(mujoco.MjModel.from_xml_string(arm.format(0)))
 
 
 def test_ties_that_give_way_are_said_to() -> None:
