@@ -119,6 +119,8 @@ class PhysicalDynamics(Dynamics):
         self.model, self.recover, self.frame_skip = model, recover, frame_skip
         self.max_step, self.max_steps, self.randomise = max_step, max_steps, randomise
         self.threads = threads
+        #: whether the last fit came to its end, or phi would have moved on with more steps
+        self.settled = False
         self.observation_noise = (
             None if observation_noise is None else noise_of_each(observation_noise, recover, "observation_noise")
         )
@@ -384,6 +386,7 @@ class PhysicalDynamics(Dynamics):
             values, taken = self._descend(problem, begin, most)
             vague = problem.vague(values, begin)
         self._values.copy_(th.as_tensor(values))
+        self.settled = taken < most
         if taken and not self.runs_on(data):
             self._values.copy_(th.as_tensor(begin))
             warnings.warn(

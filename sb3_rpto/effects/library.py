@@ -41,8 +41,8 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
     actuator's ``gain``, ``gear`` or ``strength`` command_gain, its ``kp`` or ``strength`` servo_gain,
     its ``kv`` servo_damping or, of a velocity servo, velocity_servo_gain, ``option.density`` and ``option.viscosity``
     fluid. A declared mass leaves payload in: it moves the centre of mass too.
-    soft_friction, held forces and gravity_scale, which no machine has, mass_scale, com_offset, contact_softness,
-    external_force, command_offset and command_smoothing are left out unless they are named.
+    soft_friction, held forces and gravity_scale, which no machine has, mass_scale, inertia_scale, com_offset,
+    contact_softness, external_force, command_offset and command_smoothing are left out unless they are named.
 
     :param model: the compiled model
     :param exclude: names of declared parameters, as :func:`~sb3_rpto.effects.declare` takes them
