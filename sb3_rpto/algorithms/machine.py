@@ -17,6 +17,7 @@ from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.simulator import check_source
+from sb3_rpto.effects import Declared
 from sb3_rpto.effects.model import differing, sites_act
 from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import layers, mujoco_model, single_env, state_map
@@ -184,11 +185,18 @@ def doubt_what_is_left(dynamics: Dynamics, error: float, data: Transitions) -> b
     if not dynamics.settled or len(data) < ENOUGH:
         return False
     if error > EXACT and dynamics.undone(data) < UNDONE:
+        firm = [e.label for e in dynamics.simulation.effects if isinstance(e, Declared) and e.firm]
+        gives_way = (
+            f"; {', '.join(firm)} is 0 in the model and is fitted as friction that holds at rest, where MuJoCo's own "
+            "gives way over 20 ms: of a simulated target give it a small value in the MJCF"
+            if firm
+            else ""
+        )
         warnings.warn(
-            f"after the fit the one-step error is still {error:.2g} of a typical step's change, and it is not the noise "
-            "of sensors: something differs that was not declared, and the declared numbers may have moved away from the "
-            "truth to make up for it; declare further numbers (of a mass the inertia, too), or pass close_loop=True, "
-            "which looks for what is missing",
+            f"after the fit the one-step error is still {error:.2g} of a typical step's change, and sensor noise does "
+            "not explain it: something differs that was not declared, and the declared numbers may have moved away "
+            "from the truth to make up for it; declare further numbers (of a mass the inertia, too), or pass "
+            f"close_loop=True, which looks for what is missing{gives_way}",
             stacklevel=3,
         )
     return True

@@ -50,8 +50,8 @@ class Parameter:
     :param upper: largest value
     :param null: value at which the effect does nothing; for a shape parameter (any value does) where a fit starts
     :param shape: True when the parameter means nothing while the others are at their null values
-    :param starts: where a fit may start as well, in sizes from the null; default: for a shape :meth:`spread`, else none.
-        At the null a shape may hide what the others do, and a limit that nothing reaches does nothing
+    :param starts: where a fit may start as well, in sizes from the null; default: :meth:`spread` for a shape, else
+        none. At the null a shape may hide what the others do, and a limit that nothing reaches does nothing
     :param own: field of the model that it adds to, e.g. ``"dof_damping"`` or ``"opt.density"``: values may go below
         ``lower`` by what the model has there, for a target that has less of it
     """

@@ -62,13 +62,16 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
     return found
 
 
-def given(model: mujoco.MjModel, declared: Sequence[str], known: Sequence[Effect] = ()) -> list[Effect]:
+def given(
+    model: mujoco.MjModel, declared: Sequence[str], known: Sequence[Effect] = (), soft: bool = False
+) -> list[Effect]:
     """What a model has from the start: declared numbers at their nominal values, and effects that are known beforehand.
 
     :param model: the compiled model
     :param declared: names, as :func:`~sb3_rpto.effects.declare` takes them
     :param known: effects of the library with the values that are known; declared numbers among them count as declared,
         and begin where the model has them
+    :param soft: whether declared friction of joints that have none in the model gives way near rest, as MuJoCo's own
     :raises ValueError: a name or an effect that the model does not have, or has twice; a known effect that does nothing
     :raises TypeError: ``known`` holds something else
     """
@@ -85,7 +88,10 @@ def given(model: mujoco.MjModel, declared: Sequence[str], known: Sequence[Effect
             )
     # Bounds are those of the last entry: what the user declared.
     names = [*(effect.label for effect in known if isinstance(effect, Declared)), *declared]
-    found: list[Effect] = [*declare(model, names)]
+    numbers = declare(model, names)
+    for number in numbers:
+        number.soft = soft and number.firm
+    found: list[Effect] = [*numbers]
     everywhere, free = ({e.label for e in candidates(model, taken, LIBRARY)} for taken in ((), names))
     for effect in [effect for effect in known if not isinstance(effect, Declared)]:
         label = effect.label

@@ -100,8 +100,8 @@ def trace(
     _check_arguments(data, seed, candidates, horizon, calibrate, threads)
     say = _steady(progress)
 
-    def prepared(data: Measurements, simulated: bool, kinds: Sequence[str] | None) -> SetUp:
-        return prepare(model, data, declared, seed, kinds, horizon, threads, known, simulated)
+    def prepared(data: Measurements, simulated: bool, kinds: Sequence[str] | None, soft: bool = False) -> SetUp:
+        return prepare(model, data, declared, seed, kinds, horizon, threads, known, simulated, soft)
 
     def search(on: SetUp) -> Found:
         at, finer = partial(on.selectors, say=say), partial(on.finer, say=say)

@@ -259,7 +259,7 @@ def heavier_without_inertia(factor=1.3):
 
 def test_exact_data_that_a_fit_still_misses_are_told_once():
     made = model(heavier_without_inertia(), "pole.mass", "InvertedPendulum-v5")
-    with pytest.warns(UserWarning, match=r"not the noise of sensors: something differs that was not declared"):
+    with pytest.warns(UserWarning, match=r"sensor noise does not explain it: something differs that was not declared"):
         made.learn(160, source_timesteps=0)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="after the fit")
