@@ -19,6 +19,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_rpto.algorithms import zips
 from sb3_rpto.algorithms.arguments import (
     begin_temperature,
     check_values_of,
@@ -28,7 +29,7 @@ from sb3_rpto.algorithms.arguments import (
 from sb3_rpto.algorithms.bookkeeping import STEP, TARGET_SEED_OFFSET, RuleOfEnvironment, TwoWorlds
 from sb3_rpto.algorithms.machine import check_simulator
 from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
-from sb3_rpto.algorithms.worlds import find_ledger
+from sb3_rpto.algorithms.worlds import check_environment, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.effects.names import near
 from sb3_rpto.envs.state import reseed, restore_state, restore_statistics, save_state, save_statistics
@@ -139,8 +140,9 @@ class Resumable(TwoWorlds):
         :param args: as SB3's ``load``
         :param target_env: the target, or its id
         :param kwargs: as SB3's ``load``
-        :raises ValueError: for a file that another algorithm saved, a target that is not passed by name, and arguments
-            that a saved model does not change
+        :raises ValueError: for a file that is no zip of this algorithm's, or a damaged one, a target that is not passed
+            by name, and arguments that a saved model does not change
+        :raises TypeError: for what is no path, or no environment
         """
         if args and not isinstance(args[0], str | th.device):
             raise ValueError(f"load() takes {args[0]!r} for the device; pass a target by name, as target_env=")
@@ -155,14 +157,22 @@ class Resumable(TwoWorlds):
         for name in kwargs:
             if name not in known:
                 raise ValueError(f"load() was given {name!r}, which is no argument; {near(name, known)}")
-        with one_kind_of_temperature(kwargs):
-            model = super().load(path, gym.make(env) if isinstance(env, str) else env, *args, **kwargs)
-        begin_temperature(model, kwargs.get("ent_coef"))
-        if model._resume_state is None:
+        file = zips.located(path, "path")
+        content = zips.look_into(file, "path")
+        if "_resume_state" not in content:
+            misfit = zips.misfit_of_sac(content)
             raise ValueError(
-                f"{path} was not saved by {cls.__name__}; start from a SAC model by "
-                f"{cls.__name__}.from_source(path, env, target_env=...)"
+                f"{path} was not saved by {cls.__name__}"
+                + (f" ({misfit})" if misfit else "")
+                + f"; start from a SAC model by {cls.__name__}.from_source(path, env, target_env=...)"
             )
+        env = gym.make(env) if isinstance(env, str) else env
+        if env is not None:
+            check_environment(env, "env")
+        with one_kind_of_temperature(kwargs):
+            model = super().load(file, env, *args, **kwargs)
+        begin_temperature(model, kwargs.get("ent_coef"))
+        assert model._resume_state is not None  # it is in the zip
         check_values_of(model)
         # The seed of its beginning is not one given now; one that was given before it was saved anew is.
         model._new_seed = None

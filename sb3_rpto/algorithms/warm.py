@@ -14,9 +14,8 @@ import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_rpto.algorithms import recorded
+from sb3_rpto.algorithms import recorded, zips
 from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
 from sb3_rpto.algorithms.source import EpisodeSource
@@ -60,20 +59,17 @@ def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
         return source_model
     if not isinstance(source_model, str | os.PathLike):
         raise TypeError(f"source_model must be a SAC or the path of its zip, not {type(source_model).__name__}")
+    file = zips.located(source_model, "source_model")
+    misfit = zips.misfit_of_sac(zips.look_into(file, "source_model"))
     try:
+        if misfit:
+            raise ValueError(misfit)
         # Its seed is that of its own training, and SB3 would seed the whole process with it.
-        sac = SAC.load(source_model, device=device, custom_objects={"seed": None})
-        if not isinstance(sac.policy, SACPolicy):  # TQC's zips have all that SAC asks for
-            raise TypeError(f"its policy is a {type(sac.policy).__name__}")
-        return sac
+        return SAC.load(file, device=device, custom_objects={"seed": None})
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"source_model={str(source_model)!r} is not the zip of a SAC ({error}); a model of this package goes on "
             "with its own class's load(), and what that loads may be a source_model"
-        ) from error
-    except FileNotFoundError as error:
-        raise FileNotFoundError(
-            f"source_model={str(source_model)!r}: there is no such file; pass a SAC's zip"
         ) from error
 
 

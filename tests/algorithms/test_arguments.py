@@ -1,6 +1,7 @@
 """What is refused before anything is built, each check by itself."""
 
 import warnings
+import zipfile
 
 import gymnasium as gym
 import numpy as np
@@ -341,8 +342,60 @@ def test_a_source_model_of_another_kind_is_refused(agent, error, tmp_path):
 
 def test_a_zip_of_tqc_is_no_sacs_though_it_loads_as_one(tmp_path):
     TQC("MlpPolicy", pendulum(), policy_kwargs={"net_arch": [4]}, buffer_size=10).save(tmp_path / "tqc.zip")
-    with pytest.raises(ValueError, match=r"is not the zip of a SAC \(its policy is a TQCPolicy"):
+    with pytest.raises(ValueError, match=r"is not the zip of a SAC \(another .* a policy of sb3_contrib\.tqc"):
         RPTO.from_source(tmp_path / "tqc.zip", pendulum(), pendulum(12.0))
+
+
+@pytest.mark.parametrize("agent", [PPO, TD3, TQC])
+def test_load_says_that_a_zip_is_another_algorithms(agent, tmp_path):
+    agent("MlpPolicy", pendulum(), policy_kwargs={"net_arch": [4]}).save(tmp_path / "other.zip")
+    of_policy = agent.policy_aliases["MlpPolicy"].__module__
+    with pytest.raises(
+        ValueError, match=rf"other.zip was not saved by RPTO \(.* a policy of {of_policy}\).*from_source"
+    ):
+        RPTO.load(tmp_path / "other.zip", pendulum(), target_env=pendulum(12.0))
+
+
+def _no_zips(folder):
+    """Paths that hold no whole zip of a model, by what is to be said of them."""
+    PPO("MlpPolicy", pendulum(), policy_kwargs={"net_arch": [4]}).save(folder / "whole.zip")
+    whole = (folder / "whole.zip").read_bytes()
+    (folder / "cut.zip").write_bytes(whole[: len(whole) // 2])
+    (folder / "text.zip").write_text("no zip at all")
+    (folder / "flipped.zip").write_bytes(whole.replace(b'"policy_class"', b'"policy_clash"', 1))
+    (folder / "empty").mkdir()
+    with zipfile.ZipFile(folder / "photos.zip", "w") as archive:
+        archive.writestr("beach.png", b"")
+    return {
+        "cut.zip": "is a zip that was cut off; copy it anew",
+        "text.zip": "is no zip of a model",
+        "flipped.zip": "is damaged at its entry 'data'",
+        "empty": "is a folder, without the zip of a model",
+        ".": "is a folder; pass the zip of a model, such as 'cut.zip' in it",
+        "photos.zip": "is no zip of a model of Stable-Baselines3",
+    }
+
+
+def test_what_is_no_whole_zip_of_a_model_is_told(tmp_path):
+    for name, said in _no_zips(tmp_path).items():
+        with pytest.raises(ValueError, match=f"path=.*{said}"):
+            RPTO.load(tmp_path / name)
+        with pytest.raises(ValueError, match=f"source_model=.*{said}"):
+            RPTO.from_source(tmp_path / name, pendulum())
+    with pytest.raises(ValueError, match="is a zip that was cut off"), (tmp_path / "cut.zip").open("rb") as file:
+        RPTO.load(file)
+    with pytest.raises(FileNotFoundError, match=r"path='nowhere': there is no such file"):
+        RPTO.load("nowhere")
+    with pytest.raises(TypeError, match="path must be the path of a zip or an open file, not dict"):
+        RPTO.load({})
+
+
+def test_a_zip_without_its_suffix_is_found_beside_a_folder_of_that_name(tmp_path):
+    small(RPO).save(tmp_path / "model.zip")
+    (tmp_path / "model").mkdir()
+    assert RPO.load(tmp_path / "model").env is None
+    with pytest.raises(TypeError, match="env must be a gymnasium environment"):
+        RPO.load(tmp_path / "model", 3)
 
 
 @pytest.mark.parametrize("given", [pendulum, [pendulum]])

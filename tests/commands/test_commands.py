@@ -366,7 +366,7 @@ BAD = {
     "transfer A/model.zip T --out FOREIGN": "holds a model.zip that no run of ours wrote",
     "transfer A/model.zip T --out O --set n_steps=3": "n_steps",
     "transfer absent.zip T --out O": "ZIP: there is no file 'absent.zip'",
-    "transfer A/config.json T --out O": "is not the zip of a SAC",
+    "transfer A/config.json T --out O": "is no zip of a model",
     "transfer A/model.zip T --out O --source-data x.npz": "--source-data: there is no file 'x.npz'",
     "transfer A/model.zip T --out O --method rtpo": "choose one of zero-shot, rpo",
     "transfer A/model.zip rpto/ContinuousCartPole-v0 --out O": "is the source itself",
