@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
+from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
@@ -29,6 +30,7 @@ from sb3_rpto.algorithms.arguments import (
 from sb3_rpto.algorithms.bookkeeping import STEP, TARGET_SEED_OFFSET, RuleOfEnvironment, TwoWorlds
 from sb3_rpto.algorithms.machine import check_simulator
 from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
+from sb3_rpto.algorithms.plain_sac import sac_of_model
 from sb3_rpto.algorithms.worlds import check_environment, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.effects.names import near
@@ -77,17 +79,41 @@ class Resumable(TwoWorlds):
     ) -> None:
         """Save all that a resumed run needs, except the replay buffers (``save_replay_buffer``); atomic for paths."""
         loaded = self._resume_state  # a loaded model that has not learned since stands where it was saved first
-        config, learner = self.dynamics_config, self.snapshots.get("learner")
+        config, learner, kwargs = self.dynamics_config, self.snapshots.get("learner"), self.replay_buffer_kwargs
         since = {"warm": self._warm, "learner": learner, "seed": self._new_seed}
         try:
             self._resume_state = {**loaded, **since} if loaded else capture(self)
             if self.env is not None:
                 self._resume_state["normalised"] = normalises(self.get_vec_normalize_env())
             self._resume_state["algorithm"] = _algorithm(type(self))
+            self._resume_state["target_size"] = kwargs.get("target_size")
             self.dynamics_config = _picklable(config)
-            write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
+            # SAC's buffer, in a SAC that loads the zip, has no target.
+            self.replay_buffer_kwargs = {name: value for name, value in kwargs.items() if name != "target_size"}
+            write_atomically(path, lambda file: self._write_zip(file, exclude, include))
         finally:
-            self._resume_state, self.dynamics_config = loaded, config
+            self._resume_state, self.dynamics_config, self.replay_buffer_kwargs = loaded, config, kwargs
+
+    def _write_zip(self, file: Any, exclude: Iterable[str] | None, include: Iterable[str] | None) -> None:
+        """SB3's zip, and in it what SB3 does not read, so that ``SAC.load`` takes the file."""
+        if not isinstance(file, str | pathlib.Path):  # it may be open for writing alone
+            whole = io.BytesIO()
+            self._write_zip_to(whole, exclude, include)
+            file.write(whole.getbuffer())
+        else:
+            self._write_zip_to(file, exclude, include)
+
+    def _write_zip_to(self, file: Any, exclude: Iterable[str] | None, include: Iterable[str] | None) -> None:
+        super().save(file, exclude, include)
+        zips.append_states(file, {name: recursive_getattr(self, name).state_dict() for name in self._own_states()})
+
+    def to_sac(self) -> SAC:
+        """The policy in a plain SAC of Stable-Baselines3, with its critics, temperature and optimisers.
+
+        It has no environment and no buffers, acts as this model does, learns on after ``set_env()``, and its zip needs
+        nothing of this package.
+        """
+        return sac_of_model(self)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Save both replay buffers as one pickle; atomic for paths."""
@@ -171,6 +197,7 @@ class Resumable(TwoWorlds):
             check_environment(env, "env")
         with one_kind_of_temperature(kwargs):
             model = super().load(file, env, *args, **kwargs)
+        model._put_states(zips.read_states(file, model._own_states(), model.device))
         begin_temperature(model, kwargs.get("ent_coef"))
         assert model._resume_state is not None  # it is in the zip
         check_values_of(model)
@@ -215,21 +242,37 @@ class Resumable(TwoWorlds):
         """
 
     def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto") -> None:
-        """As in SB3; a model that was given parameters counts as warm-started and is not trained in the source."""
-        super().set_parameters(load_path_or_dict, exact_match, device)
+        """As in SB3; a model that was given parameters counts as warm-started and is not trained in the source.
+
+        The parameters are SAC's. A zip of this package brings the dynamics, too.
+        """
+        given, own = load_path_or_dict, self._own_states()
+        if not isinstance(given, dict):
+            file = zips.located(given, "load_path_or_dict")
+            given = load_from_zip_file(file, load_data=False, device=device)[1] | zips.read_states(
+                file, own, self.device
+            )
+        super().set_parameters({name: value for name, value in given.items() if name not in own}, exact_match, device)
+        self._put_states({name: value for name, value in given.items() if name in own})
         self.snapshots.pop("learner", None)  # what goes on learning is this one
         self._warm = True
 
+    def _own_states(self) -> list[str]:
+        """Names of modules and optimizers beside SAC's."""
+        if self.dynamics is None:
+            return []
+        return ["dynamics", *(["dynamics.optimizer"] if hasattr(self.dynamics, "optimizer") else [])]
+
+    def _put_states(self, states: dict[str, Any]) -> None:
+        """Restore modules and optimizers.
+
+        :param states: by the names of :meth:`_own_states`
+        """
+        for name, state in states.items():
+            recursive_getattr(self, name).load_state_dict(state)
+
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *NOT_SAVED]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, variables = super()._get_torch_save_params()
-        if self.dynamics is not None:
-            state_dicts.append("dynamics")
-            if hasattr(self.dynamics, "optimizer"):
-                state_dicts.append("dynamics.optimizer")
-        return state_dicts, variables
 
 
 def _algorithm(cls: type) -> str:

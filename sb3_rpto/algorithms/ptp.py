@@ -201,6 +201,8 @@ class PTP(MBPO):
         self.logger.record("dynamics/mean_squared_error", float(errors.mean()))
         self.logger.record("dynamics/error_network_loss", self.errors.fit(data, predicted, errors, self.error_steps))
 
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, variables = super()._get_torch_save_params()
-        return [*state_dicts, "errors", "errors.optimizer"], variables
+    def _own_states(self) -> list[str]:
+        return [*super()._own_states(), "errors", "errors.optimizer"]
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "errors"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import numpy as np
+from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import PyTorchObs
 
@@ -180,6 +181,13 @@ class SLBO(MBPO):
         self.logger.record("dynamics/error", self.dynamics.error(data))
         if self._offline:  # as in fit_dynamics()
             self.dump_logs()
+
+    def to_sac(self) -> SAC:
+        """Refuse: what acts is TRPO's policy, which no SAC holds.
+
+        :raises NotImplementedError: always
+        """
+        raise NotImplementedError("SLBO acts by TRPO's policy, which no SAC holds; save it, and load it by SLBO.load()")
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

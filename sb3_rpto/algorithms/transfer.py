@@ -17,7 +17,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_rpto.algorithms import arguments, checkpoint, dynamics_arguments, warm
+from sb3_rpto.algorithms import arguments, checkpoint, dynamics_arguments, plain_sac, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.closing import LoopCloser, trace_log
 from sb3_rpto.algorithms.listeners import check_callbacks
@@ -265,6 +265,8 @@ class TransferAlgorithm(Looping):
         check_spaces(self.observation_space, self.action_space)
         # SB3 builds the buffer from these two attributes; the user's choice applies to each side.
         side_class, kwargs = self.replay_buffer_class, self.replay_buffer_kwargs
+        saved = (self._resume_state or {}).get("target_size")  # while a checkpoint is loaded
+        kwargs = {**({} if saved is None else {"target_size": saved}), **kwargs}
         own: dict[str, Any] = {name: value for name, value in kwargs.items() if name == "target_size"}
         own["side_kwargs"] = {name: value for name, value in kwargs.items() if name != "target_size"}
         if side_class not in (None, DualReplayBuffer):
@@ -296,6 +298,7 @@ class TransferAlgorithm(Looping):
         target_env: GymEnv | str | None = None,
         *,
         source_data: ReplayBuffer | str | pathlib.Path | None = None,
+        weights_only: bool = False,
         **kwargs: Any,
     ) -> Self:
         """Warm start from a SAC trained in the source: actor, critics, their targets and the temperature.
@@ -305,15 +308,21 @@ class TransferAlgorithm(Looping):
         :param target_env: the target
         :param source_data: transitions of the source (buffer, pickle or ``.npz``); D_source starts with them and the
             dynamics' phi_0 is fitted to them, instead of to fresh source steps
+        :param weights_only: read the zip without running a pickle of it, which may do anything: for a stranger's
+            (:func:`~sb3_rpto.algorithms.plain_sac.sac_of_weights`)
         :param kwargs: constructor arguments; they win over the source model's and the preset's
         :raises ValueError: when the source model's spaces are not the environment's
         """
-        sac = warm.load_sac(source_model, kwargs.get("device", "auto"))
         if isinstance(env, str):
             env = gym.make(env)
         check_environment(env, "env")
+        device = kwargs.get("device", "auto")
+        if weights_only:
+            sac = plain_sac.sac_of_weights(source_model, env, kwargs.get("policy_kwargs"), device)
+        else:
+            sac = warm.load_sac(source_model, device)
         warm.check_source_spaces(sac, env)
-        settings = {**warm.carried_arguments(sac), **kwargs}
+        settings = {**plain_sac.carried_arguments(sac), **kwargs}
         model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **settings)
         # "auto" asks for a learned temperature, a number or "auto_0.5" for that one.
         warm.carry_over(sac, model, temperature=kwargs.get("ent_coef", "auto") == "auto")

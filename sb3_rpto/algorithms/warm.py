@@ -31,19 +31,8 @@ from sb3_rpto.tracing import Measurements
 PHI_0_STEPS, PHI_0_UPDATES = 25_000, 5_000
 #: Source steps that fill D_source before the first target step when nothing else did.
 FIRST_SOURCE_STEPS = 5_000
-#: What a warm start takes over from the source model, unless the user passes it.
-CARRIED = (
-    *("learning_rate", "batch_size", "tau", "gamma", "ent_coef", "target_entropy", "target_update_interval"),
-    *("use_sde", "sde_sample_freq", "use_sde_at_warmup"),
-)
 #: Options of an optimizer that do not decide what it keeps of each parameter.
 FREE_OPTIONS = ("params", "lr", "weight_decay", "betas", "eps", "foreach", "fused", "capturable", "differentiable")
-
-
-def carried_arguments(sac: SAC) -> dict[str, Any]:
-    """Constructor arguments that a warm start takes over from the source model."""
-    policy_kwargs = {name: value for name, value in sac.policy_kwargs.items() if name != "use_sde"}
-    return {**{name: getattr(sac, name) for name in CARRIED}, "policy_kwargs": policy_kwargs}
 
 
 def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
