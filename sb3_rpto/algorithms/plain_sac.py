@@ -72,15 +72,16 @@ def sac_of_weights(path: Any, env: Any, policy_kwargs: Mapping[str, Any] | None,
             f"source_model={str(path)!r} holds its policy_kwargs as a pickle, which weights_only=True does not run; "
             "pass policy_kwargs="
         )
-    settings["policy_kwargs"] = {name: value for name, value in told.items() if name != "use_sde"}
+    told = {name: value for name, value in told.items() if name != "use_sde"}
+    settings["policy_kwargs"] = dict(told)  # to which SB3 adds
     sac = _built("MlpPolicy", env.observation_space, env.action_space, settings, device)
     _, parameters, variables = load_from_zip_file(file, load_data=False, device=sac.device)
     try:
         sac.set_parameters(parameters, device=sac.device)
     except (RuntimeError, ValueError) as error:
         raise ValueError(
-            f"source_model={str(path)!r} holds other networks than policy_kwargs={settings['policy_kwargs']} make for "
-            f"env ({error}); pass those of the agent"
+            f"source_model={str(path)!r} holds other networks than policy_kwargs={told} make for env "
+            f"({' '.join(str(error).split())[:300]}); pass those of the agent"
         ) from error
     _set_temperature(sac, variables or {})
     return sac

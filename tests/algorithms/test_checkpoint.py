@@ -4,6 +4,7 @@ import base64
 import contextlib
 import io
 import json
+import os
 import pickle
 import tempfile
 import threading
@@ -17,7 +18,7 @@ import pytest
 import torch as th
 from conftest import OURS, PHI_0_STEPS, SMALL_ENSEMBLE, SMALL_POLICY, pendulum, small
 from gymnasium.envs.classic_control import PendulumEnv
-from stable_baselines3 import SAC
+from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -547,6 +548,52 @@ def test_what_sb3_leaves_alone_in_the_zip_comes_back(tmp_path):
     other = small(RPTO, seed=1)
     other.set_parameters(tmp_path / "m.zip")
     assert th.equal(other.dynamics.input_mean, model.dynamics.input_mean)
+
+
+class Runs:
+    """A pickle of it makes a folder when it is read."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.folder),)
+
+
+@pytest.mark.parametrize("ent_coef", ["auto", 0.3])
+def test_a_strangers_weights_are_read_without_running_a_pickle(ent_coef, tmp_path):
+    given = {"policy_kwargs": {"net_arch": [8, 4]}, "gamma": 0.9, "ent_coef": ent_coef, "device": "cpu"}
+    sac = SAC("MlpPolicy", pendulum(), learning_starts=10, seed=0, **given).learn(30)
+    sac.evil = Runs(tmp_path / "ran")
+    sac.save(tmp_path / "sac")
+    model = RPO.from_source(tmp_path / "sac.zip", pendulum(), pendulum(12.0), weights_only=True, device="cpu")
+    assert not (tmp_path / "ran").exists()
+    assert (model.gamma, model.policy_kwargs["net_arch"]) == (0.9, [8, 4])
+    assert float(model.temperature()) == pytest.approx(
+        float(sac.log_ent_coef.detach().exp() if ent_coef == "auto" else ent_coef)
+    )
+    for name, value in sac.policy.state_dict().items():
+        assert th.equal(value, model.policy.state_dict()[name]), name
+    assert model.actor.optimizer.state_dict()["state"][0]["step"] == sac._n_updates
+    RPO.from_source(tmp_path / "sac.zip", pendulum(), pendulum(12.0), device="cpu")
+    assert (tmp_path / "ran").exists()  # as one that reads the pickles does
+
+
+def test_what_only_a_pickle_tells_of_a_policy_is_asked_for(tmp_path):
+    kwargs = {"net_arch": [8], "activation_fn": th.nn.Tanh}
+    SAC("MlpPolicy", pendulum(), policy_kwargs=kwargs, device="cpu").save(tmp_path / "sac")
+    worlds = (pendulum(), pendulum(12.0))
+    with pytest.raises(ValueError, match=r"policy_kwargs as a pickle.*pass policy_kwargs="):
+        RPO.from_source(tmp_path / "sac.zip", *worlds, weights_only=True)
+    with pytest.raises(ValueError, match=r"other networks than policy_kwargs=\{'net_arch': \[9\]\}"):
+        RPO.from_source(tmp_path / "sac.zip", *worlds, weights_only=True, policy_kwargs={"net_arch": [9]})
+    model = RPO.from_source(tmp_path / "sac.zip", *worlds, weights_only=True, policy_kwargs=kwargs)
+    assert model.policy_kwargs["activation_fn"] is th.nn.Tanh
+    TD3("MlpPolicy", pendulum(), policy_kwargs={"net_arch": [8]}).save(tmp_path / "td3")
+    with pytest.raises(ValueError, match=r"td3\.zip' is not the zip of a SAC"):
+        RPO.from_source(tmp_path / "td3.zip", *worlds, weights_only=True)
+    with pytest.raises(TypeError, match="must be the path of a zip where weights_only=True, not SAC"):
+        RPO.from_source(SAC("MlpPolicy", pendulum()), *worlds, weights_only=True)
 
 
 def test_a_zip_of_rpto_is_a_source_model_and_slbos_is_not(tmp_path):
