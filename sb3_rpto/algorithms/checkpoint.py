@@ -31,6 +31,7 @@ from sb3_rpto.algorithms.bookkeeping import STEP, TARGET_SEED_OFFSET, RuleOfEnvi
 from sb3_rpto.algorithms.machine import check_simulator
 from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
 from sb3_rpto.algorithms.plain_sac import sac_of_model
+from sb3_rpto.algorithms.settings import check_given
 from sb3_rpto.algorithms.worlds import check_environment, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.effects.names import near
@@ -183,6 +184,7 @@ class Resumable(TwoWorlds):
         for name in kwargs:
             if name not in known:
                 raise ValueError(f"load() was given {name!r}, which is no argument; {near(name, known)}")
+        check_given({**({"device": args[0]} if args else {}), **kwargs})
         file = zips.located(path, "path")
         content = zips.look_into(file, "path")
         if "_resume_state" not in content:

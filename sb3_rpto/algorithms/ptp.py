@@ -14,6 +14,7 @@ from sb3_rpto.algorithms.regression import regress
 from sb3_rpto.algorithms.source import BranchSource, SourceWorld, sample_policy
 from sb3_rpto.algorithms.update import RelativeUpdate
 from sb3_rpto.dynamics.base import Prediction, Transitions
+from sb3_rpto.ranges import check, whole
 
 
 def squared_error(predicted: Prediction, data: Transitions, beta: float) -> th.Tensor:
@@ -176,9 +177,7 @@ class PTP(MBPO):
 
     def _check_numbers(self) -> None:
         super()._check_numbers()
-        for name in ("n_candidates", "horizon", "error_steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check(dict.fromkeys(("n_candidates", "horizon", "error_steps"), whole(1)), vars(self))
 
     def _setup_model(self) -> None:
         super()._setup_model()

@@ -15,6 +15,7 @@ from sb3_rpto.algorithms.worlds import share_normalisation
 from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.deterministic import DeterministicDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
+from sb3_rpto.ranges import check, whole
 
 
 class SLBO(MBPO):
@@ -81,9 +82,8 @@ class SLBO(MBPO):
 
     def _check_numbers(self) -> None:
         super()._check_numbers()
-        for name in ("iterations", "model_steps", "policy_updates", "rollout_samples", "rollout_length"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        counts = ("iterations", "model_steps", "policy_updates", "rollout_samples", "rollout_length")
+        check(dict.fromkeys(counts, whole(1)), vars(self))
         if self.rollout_samples % self.rollout_length:
             raise ValueError(
                 f"rollout_samples={self.rollout_samples} is no multiple of rollout_length={self.rollout_length}; the "

@@ -17,7 +17,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_rpto.algorithms import arguments, checkpoint, dynamics_arguments, plain_sac, warm
+from sb3_rpto.algorithms import arguments, checkpoint, dynamics_arguments, plain_sac, settings, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.closing import LoopCloser, trace_log
 from sb3_rpto.algorithms.listeners import check_callbacks
@@ -140,7 +140,7 @@ class TransferAlgorithm(Looping):
         model_train_freq: int = 250,
     ) -> None:
         self._passed |= arguments.set_among(TransferAlgorithm.__init__, locals())  # by a subclass's __init__, too
-        arguments.check_learning_rate(learning_rate)
+        settings.check_given(locals())
         if isinstance(env, str):
             env = gym.make(env)
         if env is not None:  # SB3's load() builds the object before it has an env
@@ -316,14 +316,15 @@ class TransferAlgorithm(Looping):
         if isinstance(env, str):
             env = gym.make(env)
         check_environment(env, "env")
+        settings.check_given(kwargs)
         device = kwargs.get("device", "auto")
         if weights_only:
             sac = plain_sac.sac_of_weights(source_model, env, kwargs.get("policy_kwargs"), device)
         else:
             sac = warm.load_sac(source_model, device)
         warm.check_source_spaces(sac, env)
-        settings = {**plain_sac.carried_arguments(sac), **kwargs}
-        model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **settings)
+        given = {**plain_sac.carried_arguments(sac), **kwargs}
+        model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **given)
         # "auto" asks for a learned temperature, a number or "auto_0.5" for that one.
         warm.carry_over(sac, model, temperature=kwargs.get("ent_coef", "auto") == "auto")
         if source_data is not None:
@@ -356,7 +357,16 @@ class TransferAlgorithm(Looping):
             default 10 x ``total_timesteps``, at most 300,000; 0 skips the phase
         :raises ValueError: what :func:`~sb3_rpto.algorithms.arguments.check_ready` refuses, such as no target
         """
-        arguments.check_ready(self, total_timesteps, source_timesteps, log_interval)
+        arguments.check_ready(
+            self,
+            total_timesteps,
+            source_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
         if source_timesteps is None:
             source_timesteps = min(10 * total_timesteps, 300_000)
         if not self._warm:

@@ -644,9 +644,9 @@ def test_a_checkpoint_goes_on_with_its_own_class(saves, tmp_path):
 @pytest.mark.parametrize(
     ("cls", "given", "message"),
     [
-        (PTP, {"n_candidates": 0}, "n_candidates must be at least 1"),
+        (PTP, {"n_candidates": 0}, "n_candidates must be a positive integer"),
         (PDML, {"newest_share": 1.0}, "newest_share must lie in"),
-        (SLBO, {"iterations": 0}, "iterations must be at least 1"),
+        (SLBO, {"iterations": 0}, "iterations must be a positive integer"),
         (SLBO, {"rollout_samples": 101}, "is no multiple of rollout_length"),
         (MBPO, {"weighting": "paper"}, r"MBPO does not use \['weighting'\]"),
     ],

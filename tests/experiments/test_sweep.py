@@ -178,7 +178,7 @@ def test_a_failed_run_is_kept_said_and_does_not_stop_the_others(
     assert cli.main(["benchmark", "transfer", "--suite", "smoke", "--out", str(tmp_path), "--workers", "1"]) == 1
     said = capsys.readouterr()
     assert "4 of 5 runs are done" in said.out
-    assert "_broken_0 failed: ValueError: iterations must be at least 1" in said.err
+    assert "_broken_0 failed: ValueError: iterations must be a positive integer" in said.err
     result = json.loads((tmp_path / "runs" / "ContinuousCartPole_limb-x2_broken_0.json").read_text())
     assert "Traceback" in result["error"]
     assert result["rows"] == []
