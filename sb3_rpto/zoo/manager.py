@@ -240,6 +240,15 @@ class TransferManager(ExperimentManager):
 
     # ------------------------------------------------------------------ models
 
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """As the zoo's, with the zip's suffix: the folder of its settings has the same name without it."""
+        env_name = self.env_name
+        self.env_name = f"{env_name}.zip"
+        try:
+            super().save_trained_model(model)
+        finally:
+            self.env_name = env_name
+
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         """The model to train: a checkpoint that goes on, or a new one."""
         if self.start is None:
