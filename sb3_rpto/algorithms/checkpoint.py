@@ -69,6 +69,8 @@ class Resumable(TwoWorlds):
 
     #: whether the policy knows the source, by a warm start or by training there
     _warm: bool
+    #: gradient steps of any fit of the dynamics at most, where the user passed a number; None where the preset says
+    fit_bound: int | None
     #: arguments that other algorithms have and this one does not use
     unused: ClassVar[frozenset[str]] = frozenset()
 

@@ -57,7 +57,7 @@ class TransferAlgorithm(Looping):
     :param preset: hyperparameters for what is not passed: "default", "paper" or "author"
     :param dynamics: backend of the trainable source: "ensemble" (networks), "physical" (a simulator with trainable
         numbers) or "residual" (that simulator and a small ensemble on what it still misses)
-    :param dynamics_kwargs: further arguments of the backend
+    :param dynamics_kwargs: further arguments of the backend; ``max_steps`` bounds every fit, also the first, of phi_0
     :param declared: names of the physical parameters to fit (physical backend)
     :param close_loop: trace on D_target what the simulator lacks beside the declared numbers, add it to phi and go on
         (``dynamics="physical"`` on MuJoCo); a list looks for effects of these kinds alone, an empty one for
@@ -181,6 +181,7 @@ class TransferAlgorithm(Looping):
         self.preset = preset
         self.dynamics_backend = dynamics
         self.dynamics_kwargs = arguments.plain_effects(dynamics_kwargs or {})
+        self.fit_bound = self.dynamics_kwargs.get("max_steps")
         self.declared = arguments.list_of_names(declared)
         self.close_loop, self.retrain_steps = close_loop, retrain_steps
         #: traces what the simulator lacks, and holds the reports; None with the loop open and no log to trace on

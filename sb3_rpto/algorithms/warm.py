@@ -181,12 +181,17 @@ def _collect_in_source(model: Resumable, n_steps: int) -> None:
     model.env.reset()
 
 
+def phi_0_updates(model: Resumable) -> int:
+    """Gradient steps that fit phi_0 at most: a number of the user's bounds every fit, a preset's the later ones."""
+    return min(PHI_0_UPDATES, model.fit_bound or PHI_0_UPDATES)
+
+
 def _fit_phi_0(model: Resumable, dynamics: Dynamics) -> None:
     """Let the learned dynamics describe the source before the first target step (Algorithm 1's input)."""
     data = model.transitions("source")
     if model.verbose:
         print(f"fitting the model of the source to {len(data):,} transitions, which may take minutes on a CPU")
-    for name, value in dynamics.fit(data, max_steps=PHI_0_UPDATES).items():
+    for name, value in dynamics.fit(data, max_steps=phi_0_updates(model)).items():
         model.logger.record(f"dynamics/phi_0_{name}", value)
 
 

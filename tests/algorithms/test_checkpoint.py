@@ -879,7 +879,34 @@ def test_files_are_written_whole_or_not_at_all(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["model.zip"]
 
 
+def test_a_folder_is_no_place_for_a_model(tmp_path):
+    model = small(RPO)
+    with pytest.raises(ValueError, match=r"is a folder; give the name of a file, such as .*model\.zip"):
+        model.save(tmp_path)
+    with pytest.raises(ValueError, match=r"is a folder; give the name of a file, such as .*model\.pkl"):
+        model.save_replay_buffer(str(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+    assert not tmp_path.with_name(f"{tmp_path.name}.zip").exists()
+
+
 # ---------------------------------------------------------------------- warm start
+
+
+@pytest.mark.parametrize(("passed", "steps"), [({"max_steps": 7}, 7), ({}, 40)])
+def test_the_users_max_steps_bound_the_first_fit_too(passed, steps, monkeypatch):
+    monkeypatch.setattr(warm, "PHI_0_UPDATES", 40)
+    fitted = []
+    fit = EnsembleDynamics.fit
+    monkeypatch.setattr(
+        EnsembleDynamics,
+        "fit",
+        lambda self, data, weights=None, max_steps=None: (
+            fitted.append(max_steps or self.max_steps) or fit(self, data, weights, max_steps)
+        ),
+    )
+    model = small(RPTO, dynamics_kwargs={"hidden": (8,), "n_members": 2, "n_elites": 1, **passed}, model_train_freq=5)
+    model.learn(5, source_timesteps=0)
+    assert fitted == [steps, passed.get("max_steps", 300)]  # the default preset's
 
 
 def test_from_source_takes_everything_over(tmp_path):
