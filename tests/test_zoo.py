@@ -21,7 +21,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_rpto import RPO, RPTO
-from sb3_rpto.algorithms.worlds import NotFiniteError
+from sb3_rpto.algorithms.answers import NotFiniteError
 from sb3_rpto.envs import tasks
 from sb3_rpto.experiments.methods import REGISTRY
 from sb3_rpto.presets import preset_names, resolve_preset

@@ -16,6 +16,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_rpto.algorithms import recorded, zips
+from sb3_rpto.algorithms.answers import check_rewards
 from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
 from sb3_rpto.algorithms.source import EpisodeSource
@@ -295,6 +296,8 @@ def _loaded(data: Any, model: Resumable, name: str, **how: Any) -> dict[str, np.
         raise ValueError(
             f"{name} holds actions outside [-1, 1]; scale them by policy.scale_action, as SB3's buffers do"
         )
+    if "rewards" in arrays:
+        check_rewards(f"{name} holds", arrays["rewards"])
     if not np.isin(arrays["terminations"], (0, 1)).all():
         raise ValueError(f"{name} holds values of done other than 0 and 1 (terminal, not a time limit); mend them")
     return arrays
