@@ -244,7 +244,7 @@ def test_without_matplotlib_nothing_is_started(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert run(files) == 2
-    assert "sb3-rpto[tracing]" in error(capsys)
+    assert "pip install -e '.[tracing]'" in error(capsys)
 
 
 def test_interrupt_gives_130(files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -523,4 +523,4 @@ def test_wrong_arguments_end_before_the_work(zoo, options, message, capsys):
 def test_without_the_extra_the_remedy_is_named(command, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)
     assert command.main(["--algo", "rpto"]) == 2
-    assert "pip install 'sb3-rpto[zoo]'" in capsys.readouterr().err
+    assert "pip install -e '.[zoo]'" in capsys.readouterr().err

@@ -323,6 +323,31 @@ def test_a_film_shows_three_panels(suffix: str, agent: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("named", ["folder", "zip"])
+def test_a_film_of_an_agent_that_came_from_none_shows_it_alone(named: str, agent: Path, tmp_path: Path) -> None:
+    imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")
+    model = [str(agent)] if named == "folder" else [str(agent / "model.zip"), SOURCE]
+    file = tmp_path / "film.gif"
+    assert cli.main(["enjoy", *model, "--episodes", "1", "--video", str(file), "--seconds", "0.2"]) == 0
+    frames = [frame for frame in imageio.get_reader(file)]  # noqa: C416 (as above)
+    assert frames[0].shape[:2] == (440, 604)
+    assert len(frames) > 5
+
+
+def test_what_a_film_shows_is_known_by_the_runs_folder(
+    agent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[list[str]] = []
+    monkeypatch.setattr(video, "film", lambda panels, *_: shown.append([panel.title for panel in panels]))
+    monkeypatch.setattr(video, "require", lambda path: None)
+    assert transfer(agent, tmp_path / "run", "zero-shot") == 0
+    for folder in (agent, tmp_path / "run"):
+        assert cli.main(["enjoy", str(folder), "--episodes", "1", "--video", "film.gif"]) == 0
+    assert list(map(len, shown)) == [1, 3]
+    assert shown[1][-1] == "transferred policy in the target"
+
+
+@pytest.mark.slow
 def test_a_film_of_mujoco_without_a_display(tmp_path: Path) -> None:
     pytest.importorskip("imageio", reason="the extra 'video' is not installed")
     try:  # MuJoCo alone: what fails of ours must not be skipped
@@ -404,7 +429,7 @@ BAD = {
     "train ContinuousCartPole --out O --seed -1": "--seed is -1",
     "enjoy A --video f.avi": "a film is .mp4 or .gif",
     "enjoy A --video A/model.zip/f.gif": "nothing can be written into",
-    "enjoy A --video f.gif": "--source-model",
+    "enjoy A --video f.gif --source Pendulum-v1": "pass its zip by --source-model, too",
 }
 
 
@@ -763,7 +788,7 @@ def test_without_the_extras_the_remedy_is_named(
 ) -> None:
     monkeypatch.setattr(video, "find_spec", lambda name: None)
     assert cli.main(["enjoy", str(agent), "--video", "film.mp4", "--source-model", str(agent / "model.zip")]) == 2
-    assert "pip install 'sb3-rpto[video]'" in error(capsys)
+    assert "pip install -e '.[video]'" in error(capsys)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert cli.main(["plot", str(agent), "--out", str(tmp_path / "figure.png")]) == 2
-    assert "pip install 'sb3-rpto[experiments]'" in error(capsys)
+    assert "pip install -e '.[experiments]'" in error(capsys)
