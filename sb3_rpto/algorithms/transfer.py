@@ -17,7 +17,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_rpto.algorithms import arguments, checkpoint, dynamics_arguments, plain_sac, settings, warm
+from sb3_rpto.algorithms import arguments, dynamics_arguments, plain_sac, resuming, settings, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.closing import LoopCloser, trace_log
 from sb3_rpto.algorithms.listeners import check_callbacks
@@ -374,8 +374,8 @@ class TransferAlgorithm(Looping):
             arguments.warn_of_idle_source_phase(self, source_timesteps)
         self._store_step_cut_off()
         if reset_num_timesteps and self._warm:  # else the source phase goes on all the same
-            checkpoint.leave(self)
-        checkpoint.resume_unbegun(self)
+            resuming.leave(self)
+        resuming.resume_unbegun(self)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
@@ -383,9 +383,9 @@ class TransferAlgorithm(Looping):
         self._source_world = self._source_world or self._make_source_world()
         trace_log(self)  # first of all: the log may be refused
         if not self._warm:
-            checkpoint.resume_source_phase(self)
+            resuming.resume_source_phase(self)
         self.begin_in_source(source_timesteps, progress_bar)
-        checkpoint.resume(self)
+        resuming.resume(self)
         if self.loop is not None:
             self.loop.begin(self)
         self._watch_for_null_shift()
