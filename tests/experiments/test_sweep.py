@@ -339,7 +339,7 @@ def test_bad_arguments_are_refused(argument: str, value: Any, tmp_path: Path) ->
 
 def test_a_missing_backend_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"sb3-rpto\[ray\]"):
+    with pytest.raises(ImportError, match=r"pip install -e '\.\[ray\]'"):
         sweep.run(SUITE, tmp_path, backend="ray")
 
 
