@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFr
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
+from sb3_rpto.algorithms.answers import Answers, check_finite
 from sb3_rpto.algorithms.listeners import count_in_target
 from sb3_rpto.algorithms.machine import check_machine, check_simulator, doubt, doubt_rules, doubt_what_is_left
 from sb3_rpto.algorithms.normalisation import check_normalisation, normalises, rescaled
@@ -26,7 +27,6 @@ from sb3_rpto.algorithms.worlds import (
     NullShiftCheck,
     TargetLedger,
     check_environment,
-    check_finite,
     check_pair,
     find_ledger,
     last_observations,
@@ -269,9 +269,10 @@ class TwoWorlds(PolicySnapshots):
         disturbed = self.target_env is not None and find_ledger(self.target_env).lost(warn=not starts_episode)
         noise, self.action_noise = self.action_noise, None  # SB3 would size it by the source
         try:
-            total_timesteps, callback = super()._setup_learn(
-                total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-            )
+            with Answers("source").received():  # SB3 resets it
+                total_timesteps, callback = super()._setup_learn(
+                    total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+                )
         finally:
             self.action_noise = noise
         _make_room_for_names(self.logger)
@@ -359,7 +360,8 @@ class TwoWorlds(PolicySnapshots):
         raw: Any = new_obs, reward
         if normaliser is not None:  # which clips what is infinite, and what is stored comes from below it
             raw = normaliser.get_original_obs(), normaliser.get_original_reward()
-        find_ledger(self.target_env).check(*map(np.asarray, raw), *ended.values())
+        normalised = normaliser is not None and normaliser.norm_reward
+        find_ledger(self.target_env).check(*map(np.asarray, raw), *ended.values(), normalised=normalised)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         if normaliser is not None:  # what SB3 stores is clipped then
             side = self.replay_buffer.target
