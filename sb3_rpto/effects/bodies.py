@@ -203,7 +203,7 @@ class GravityTilt(Effect):
     def write(self, world: World, x: np.ndarray) -> None:
         """Turn gravity."""
         gravity = world.field("opt.gravity")
-        gravity[:] = np.einsum("nij,nj->ni", rotations(x[:, 0], x[:, 1]), gravity)
+        gravity[:] = (rotations(x[:, 0], x[:, 1]) * gravity[:, None]).sum(axis=2)
 
 
 @register
