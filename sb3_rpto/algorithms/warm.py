@@ -243,7 +243,9 @@ def _report(model: Resumable, source: EpisodeSource) -> None:
     """Log the source phase in a group of its own and leave a checkpoint where the user gave the logger a folder."""
     for name, value in {"timesteps": model._pretrained_steps, **source.log()}.items():
         model.logger.record(f"pretrain/{name}", value)
-    model.logger.dump(step=0)
+    # As in every row of SB3's: readers of its files draw the rest against this one.
+    model.logger.record("time/total_timesteps", model.num_timesteps, exclude="tensorboard")
+    model.logger.dump(step=model.num_timesteps)
     given = model._custom_logger or model.tensorboard_log is not None or "SB3_LOGDIR" in os.environ
     if given and model.logger.dir is not None:
         folder = pathlib.Path(model.logger.dir)
