@@ -216,7 +216,7 @@ class TwoWorlds(PolicySnapshots):
         source = self._wrap_env(env, self.verbose)
         # All that may refuse it comes before anything changes.
         check_for_correct_spaces(source, self.observation_space, self.action_space)
-        check_simulator(source, self.dynamics)
+        check_simulator(source, self.dynamics, self.weighting == "value_aware")
         if self.target_env is not None:
             self._check_pair(source, find_ledger(self.target_env).venv)
         before, after, last_obs = self.get_vec_normalize_env(), unwrap_vec_normalize(source), self._last_obs

@@ -22,7 +22,7 @@ from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.closing import LoopCloser, trace_log
 from sb3_rpto.algorithms.listeners import check_callbacks
 from sb3_rpto.algorithms.looping import Looping
-from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_world
+from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_world, try_source
 from sb3_rpto.algorithms.worlds import check_environment, check_spaces, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.dynamics.base import Dynamics
@@ -233,6 +233,8 @@ class TransferAlgorithm(Looping):
                 dynamics_arguments.check_carried(self.env, self.close_loop)
                 dynamics_arguments.check_rules(self.dynamics_kwargs, self.observation_space, self.action_space)
             self._setup_model()
+            if self.env is not None:
+                try_source(self.env, self.dynamics, self.weighting == "value_aware")
             if target_env is not None:
                 self.set_target_env(target_env)
             if self.measured is not None and isinstance(self.dynamics, PhysicalDynamics):
