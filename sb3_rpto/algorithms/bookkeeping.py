@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 
 from sb3_rpto.algorithms.listeners import count_in_target
 from sb3_rpto.algorithms.machine import check_machine, check_simulator, doubt, doubt_rules
-from sb3_rpto.algorithms.normalisation import check_normalisation, normalises, rescaled
+from sb3_rpto.algorithms.normalisation import check_normalisation, normalises, rescaled, sharing
 from sb3_rpto.algorithms.snapshots import PolicySnapshots
 from sb3_rpto.algorithms.source import SourceWorld
 from sb3_rpto.algorithms.worlds import (
@@ -128,7 +128,7 @@ class TwoWorlds(PolicySnapshots):
         if isinstance(env, str):
             env = gym.make(env)
         check_environment(env, "target_env")
-        venv = self._wrap_env(env, self.verbose)
+        venv = sharing(self._wrap_env(env, self.verbose), self.env)
         if self.env is not None:
             self._check_pair(self.env, venv)
         if self.target_env is not None or self._traces_log:  # what the last target told holds for it alone

@@ -17,11 +17,12 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_rpto.algorithms import arguments, checkpoint, dynamics_arguments, warm
+from sb3_rpto.algorithms import arguments, checkpoint, dynamics_arguments, normalisation, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.closing import LoopCloser, trace_log
 from sb3_rpto.algorithms.listeners import check_callbacks
 from sb3_rpto.algorithms.looping import Looping
+from sb3_rpto.algorithms.remembered import doubt_returns
 from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_world, try_source
 from sb3_rpto.algorithms.worlds import check_environment, check_spaces, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
@@ -298,6 +299,7 @@ class TransferAlgorithm(Looping):
         target_env: GymEnv | str | None = None,
         *,
         source_data: ReplayBuffer | str | pathlib.Path | None = None,
+        vec_normalize: normalisation.Statistics = None,
         **kwargs: Any,
     ) -> Self:
         """Warm start from a SAC trained in the source: actor, critics, their targets and the temperature.
@@ -307,18 +309,23 @@ class TransferAlgorithm(Looping):
         :param target_env: the target
         :param source_data: transitions of the source (buffer, pickle or ``.npz``); D_source starts with them and the
             dynamics' phi_0 is fitted to them, instead of to fresh source steps
+        :param vec_normalize: by which the source model saw observations, or the file that its ``save()`` wrote: ``env``
+            is put into a VecNormalize with these statistics. None: those beside the zip, which is said; False: none
         :param kwargs: constructor arguments; they win over the source model's and the preset's
-        :raises ValueError: when the source model's spaces are not the environment's
+        :raises ValueError: when the source model's spaces are not the environment's, or ``vec_normalize`` is not of it
         """
         sac = warm.load_sac(source_model, kwargs.get("device", "auto"))
         if isinstance(env, str):
             env = gym.make(env)
         check_environment(env, "env")
         warm.check_source_spaces(sac, env)
+        env, statistics = normalisation.as_learned(sac, source_model, env, vec_normalize)
         settings = {**warm.carried_arguments(sac), **kwargs}
         model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **settings)
         # "auto" asks for a learned temperature, a number or "auto_0.5" for that one.
         warm.carry_over(sac, model, temperature=kwargs.get("ent_coef", "auto") == "auto")
+        if not normalisation.check_source_model(sac, statistics, model.get_vec_normalize_env()):
+            doubt_returns(sac, env)
         if source_data is not None:
             warm.fill_source(model, source_data)
         return model
@@ -361,7 +368,7 @@ class TransferAlgorithm(Looping):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
-        check_callbacks(callback, self.target_env)
+        check_callbacks(callback, self.env, self.target_env)
         self._source_world = self._source_world or self._make_source_world()
         trace_log(self)  # first of all: the log may be refused
         if not self._warm:

@@ -18,7 +18,6 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_rpto.algorithms import recorded
 from sb3_rpto.algorithms.checkpoint import Resumable
-from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.algorithms.update import as_transitions
 from sb3_rpto.buffers import World, load_transitions
@@ -100,9 +99,6 @@ def carry_over(sac: SAC, model: Resumable, temperature: bool = True) -> None:
             "policy is another action now",
             stacklevel=3,
         )
-    if sac.get_env() is not None and sac._last_obs is not None:  # it has learned there; a zip does not tell
-        learned = sac.get_vec_normalize_env()
-        check_normalisation(normalises(learned), model.get_vec_normalize_env(), "source_model", learned)
     try:
         model.policy.load_state_dict(sac.policy.state_dict())
     except RuntimeError as error:
