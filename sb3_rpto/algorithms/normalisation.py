@@ -17,6 +17,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 #: A zip's last observation is the one before it, rather than what statistics make of it, where it is so much nearer.
 NEARER = 3.0
+#: How statistics are told to from_source() and to the commands.
+PASS = "vec_normalize=FILE (--vec-normalize FILE), what VecNormalize.save() wrote"
+#: How errors call statistics that nobody has passed.
+BESIDE = "the statistics beside source_model"
 
 Statistics: TypeAlias = VecNormalize | str | pathlib.Path | Literal[False] | None
 
@@ -180,6 +184,16 @@ def _inside(observations: np.ndarray, space: spaces.Box) -> bool:
     return bool(((observations >= space.low - room) & (observations <= space.high + room)).all())
 
 
+def statistics_beside(sac: SAC, path: str | pathlib.Path) -> pathlib.Path | None:
+    """The file beside a model's zip that holds the statistics by which it saw observations; None where it saw raw ones.
+
+    :param sac: the model
+    :param path: of its zip
+    """
+    file = statistics_of(path)
+    return file if file is not None and saw_normalised(sac, read_statistics(file, BESIDE)) else None
+
+
 def has_learned_here(sac: SAC) -> bool:
     """Whether a model's own environment is the one that it has learned in; a zip does not hold it."""
     return sac.get_env() is not None and sac._last_obs is not None
@@ -206,11 +220,10 @@ def as_learned(sac: SAC, source_model: Any, env: GymEnv, given: Statistics) -> t
                 "env is in a VecNormalize with other statistics than those of vec_normalize; leave one of them out"
             )
         return env, statistics
-    if isinstance(source_model, SAC) or (file := statistics_of(source_model)) is None:
+    file = None if isinstance(source_model, SAC) else statistics_beside(sac, source_model)
+    if file is None:
         return env, None
-    statistics = read_statistics(file, "source_model's statistics")
-    if not saw_normalised(sac, statistics):
-        return env, None
+    statistics = read_statistics(file, BESIDE)
     if around is not None:
         return env, statistics
     warnings.warn(
@@ -218,7 +231,7 @@ def as_learned(sac: SAC, source_model: Any, env: GymEnv, given: Statistics) -> t
         f"it, {str(file)!r}; pass vec_normalize={str(file)!r} to say so, or vec_normalize=False where it saw raw ones",
         stacklevel=3,
     )
-    return in_statistics(env, statistics, "source_model's statistics"), statistics
+    return in_statistics(env, statistics, BESIDE), statistics
 
 
 def check_source_model(sac: SAC, statistics: VecNormalize | None, env: VecNormalize | None) -> bool:
@@ -229,7 +242,7 @@ def check_source_model(sac: SAC, statistics: VecNormalize | None, env: VecNormal
     :param env: the source's VecNormalize
     :return: whether the matter is settled, one way or the other; else what the policy earns may tell
     """
-    remedy = "pass vec_normalize=FILE, what VecNormalize.save() wrote, or env in one with those statistics"
+    remedy = f"pass {PASS}, or env in one with those statistics"
     if has_learned_here(sac):
         learned = sac.get_vec_normalize_env()
         check_normalisation(normalises(learned), env, "source_model", learned, remedy=remedy)

@@ -17,7 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_rpto.algorithms.normalisation import normalises
+from sb3_rpto.algorithms.normalisation import PASS, normalises
 from sb3_rpto.envs.copies import must_copy
 from sb3_rpto.envs.observations import layers, single_env
 
@@ -65,9 +65,8 @@ def doubt_returns(sac: SAC, env: GymEnv) -> bool:
     )
     warnings.warn(
         f"source_model earns {earned:.4g} in env, where its zip remembers {returns.mean():.4g} (means of a few "
-        f"episodes now and the last {len(returns)} of its training): did it see {how} Pass vec_normalize=FILE, what "
-        "VecNormalize.save() wrote, or vec_normalize=False with a raw env; else env is not the source that it was "
-        "trained in",
+        f"episodes now and the last {len(returns)} of its training): did it see {how} Pass {PASS}, "
+        "or a raw env; else env is not the source that it was trained in",
         stacklevel=3,
     )
     return True
