@@ -2,7 +2,12 @@
 
 from collections.abc import Iterator
 
-from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    EvalCallback,
+    ProgressBarCallback,
+    StopTrainingOnMaxEpisodes,
+)
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_rpto.algorithms.normalisation import normalises
@@ -31,7 +36,7 @@ def check_callbacks(callback: BaseCallback, source: VecEnv | None, target_env: V
                 "would jump; give it an environment of its own"
             )
         normalised = source is not None and normalises(unwrap_vec_normalize(source))
-        if isinstance(evaluated, VecEnv) and normalised and unwrap_vec_normalize(evaluated) is None:
+        if isinstance(one, EvalCallback) and normalised and unwrap_vec_normalize(one.eval_env) is None:
             raise ValueError(
                 f"{type(one).__name__}'s environment is in no VecNormalize, and the policy sees observations that "
                 "env's has normalised; give it VecNormalize(eval_env, training=False, norm_reward=False), as with SAC: "

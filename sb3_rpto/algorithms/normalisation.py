@@ -17,6 +17,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 #: A zip's last observation is the one before it, rather than what statistics make of it, where it is so much nearer.
 NEARER = 3.0
+#: Nor does an environment leave its observations' bounds by more than this share of their range.
+BEYOND = 0.1
 #: How statistics are told to from_source() and to the commands.
 PASS = "vec_normalize=FILE (--vec-normalize FILE), what VecNormalize.save() wrote"
 #: How errors call statistics that nobody has passed.
@@ -79,6 +81,8 @@ def alike(own: VecNormalize, given: VecNormalize) -> bool:
     ours, theirs = own.obs_rms, given.obs_rms
     assert isinstance(ours, RunningMeanStd)  # observations are flat Boxes, never a Dict
     assert isinstance(theirs, RunningMeanStd)
+    if ours.mean.shape != theirs.mean.shape:
+        return False
     offset = np.abs(ours.mean - theirs.mean) / np.sqrt(ours.var + 1e-8)
     ratio = (theirs.var + 1e-8) / (ours.var + 1e-8)
     return bool((offset < 1).all() and (np.abs(np.log(ratio)) < np.log(4)).all())
@@ -171,7 +175,7 @@ def saw_normalised(sac: SAC, statistics: VecNormalize | None = None) -> bool | N
     if original.dtype == np.float64:  # VecNormalize shows float32, whatever it is shown
         return seen.dtype == np.float32
     space = sac.observation_space
-    if isinstance(space, spaces.Box) and _inside(original, space) and not _inside(seen, space):
+    if isinstance(space, spaces.Box) and _far_outside(seen, space) and not _far_outside(original, space):
         return True
     if statistics is not None and normalises(statistics):
         off, step = (float(np.abs(x - seen).mean()) for x in (np.asarray(statistics.normalize_obs(original)), original))
@@ -179,9 +183,10 @@ def saw_normalised(sac: SAC, statistics: VecNormalize | None = None) -> bool | N
     return by_default
 
 
-def _inside(observations: np.ndarray, space: spaces.Box) -> bool:
-    room = 1e-3 * (1 + np.abs(observations))  # of rounding
-    return bool(((observations >= space.low - room) & (observations <= space.high + room)).all())
+def _far_outside(observations: np.ndarray, space: spaces.Box) -> bool:
+    """Whether some lie where no raw ones can: farther beyond their bounds than careless bounds are wrong."""
+    room = BEYOND * (space.high.astype(float) - space.low)  # infinite where a bound is
+    return bool(((observations < space.low - room) | (observations > space.high + room)).any())
 
 
 def statistics_beside(sac: SAC, path: str | pathlib.Path) -> pathlib.Path | None:
@@ -191,7 +196,11 @@ def statistics_beside(sac: SAC, path: str | pathlib.Path) -> pathlib.Path | None
     :param path: of its zip
     """
     file = statistics_of(path)
-    return file if file is not None and saw_normalised(sac, read_statistics(file, BESIDE)) else None
+    if file is None:
+        return None
+    statistics = read_statistics(file, BESIDE)
+    of_another = statistics.observation_space.shape != sac.observation_space.shape
+    return None if of_another or not saw_normalised(sac, statistics) else file
 
 
 def has_learned_here(sac: SAC) -> bool:

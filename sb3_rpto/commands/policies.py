@@ -53,8 +53,8 @@ class NormalisedPolicy:
 
     def predict(self, observation: Any, state: Any = None, *, deterministic: bool = False) -> tuple[np.ndarray, Any]:
         """The action for a raw observation; see :class:`Policy`."""
-        seen = self.statistics.normalize_obs(np.asarray(observation))
-        return self.policy.predict(seen, state, deterministic=deterministic)
+        raw = observation if isinstance(observation, dict) else np.asarray(observation)
+        return self.policy.predict(self.statistics.normalize_obs(raw), state, deterministic=deterministic)
 
 
 def load_policy(path: str | Path, argument: str, statistics: str | Path | None = None) -> Policy:

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 from tracking import MEAN, Tracking, solved, statistics, zipped
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms.normalisation import read_statistics, statistics_of
+from sb3_rpto.algorithms.normalisation import read_statistics, saw_normalised, statistics_of
 
 SMALL = {"hidden": (8,), "n_members": 2, "n_elites": 1}
 SETTINGS = {"device": "cpu", "policy_kwargs": SMALL_POLICY}
@@ -168,6 +168,14 @@ def test_a_raw_zip_beside_the_statistics_of_another_is_raw(tmp_path):
         assert from_zip(raw).get_vec_normalize_env() is None
 
 
+def test_statistics_of_another_task_beside_a_zip_are_nobodys(tmp_path):
+    path = zipped(tmp_path, normalised=False)
+    VecNormalize(DummyVecEnv([pendulum])).save(str(tmp_path / "vecnormalize.pkl"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert from_zip(path).get_vec_normalize_env() is None
+
+
 def test_statistics_of_nothing_are_nobodys(tmp_path):
     for name in ("raw", "normalised"):
         path = trained(tmp_path / name, np.float32, name == "normalised")
@@ -264,3 +272,14 @@ def test_an_evaluation_without_normalisation_is_refused_before_the_first_step(tm
     with pytest.raises(ValueError, match=r"EvalCallback's environment is in no VecNormalize.*training=False"):
         model.learn(10, callback=callback)
     assert model.num_timesteps == model.source_timesteps == 0
+
+
+@pytest.mark.parametrize(("seen", "told"), [(1.5, True), (1.1, None), (0.5, None)])
+def test_a_zip_tells_by_values_that_its_environment_cannot_show(seen, told):
+    """Bounds that an environment leaves by a little tell nothing."""
+    sac = SAC("MlpPolicy", pendulum(), **SETTINGS)
+    sac._last_original_obs = np.array([[0.6, 0.8, 1.0]], np.float32)
+    sac._last_obs = np.array([[seen, 0.8, 1.0]], np.float32)
+    assert saw_normalised(sac) is told
+    sac._last_original_obs = sac._last_obs.copy()
+    assert saw_normalised(sac) is None
