@@ -92,7 +92,8 @@ def run(parsed: argparse.Namespace) -> int:
     budget = shipped_settings(parsed.method if parsed.method in ALGORITHMS else "rpto", target.env_id)["n_timesteps"]
     steps = parsed.steps or budget
     _check_settings(parsed.method, settings, steps)
-    statistics = statistics_of_source(parsed.source_model, parsed.vec_normalize)
+    learns_anew = parsed.method == "sac"
+    statistics = None if learns_anew else statistics_of_source(parsed.source_model, parsed.vec_normalize)
     _check_worlds(parsed, source, target, statistics)
     if settings.get("close_loop", False) is not False:  # an empty list traces, too
         figures.require()
