@@ -208,13 +208,16 @@ def has_learned_here(sac: SAC) -> bool:
     return sac.get_env() is not None and sac._last_obs is not None
 
 
-def as_learned(sac: SAC, source_model: Any, env: GymEnv, given: Statistics) -> tuple[GymEnv, VecNormalize | None]:
+def as_learned(
+    sac: SAC, source_model: Any, env: GymEnv, given: Statistics, unpickle: bool = True
+) -> tuple[GymEnv, VecNormalize | None]:
     """The source as the policy has seen it, and the statistics by which it has, where these are known.
 
     :param sac: the source model
     :param source_model: it, or the path of its zip, beside which its statistics may lie
     :param env: the source
     :param given: the statistics; False: there are none; None: those beside the zip
+    :param unpickle: whether these may be read, as the zip's own pickles were
     :raises ValueError: ``env`` is in another VecNormalize already
     """
     around = unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None
@@ -229,6 +232,14 @@ def as_learned(sac: SAC, source_model: Any, env: GymEnv, given: Statistics) -> t
                 "env is in a VecNormalize with other statistics than those of vec_normalize; leave one of them out"
             )
         return env, statistics
+    if not unpickle and (unread := statistics_of(source_model)) is not None:
+        warnings.warn(
+            "statistics by which source_model may have seen observations normalised by VecNormalize lie beside it, "
+            f"{str(unread)!r}: that is a pickle, which weights_only=True leaves unread; pass vec_normalize= if you "
+            "trust it, or vec_normalize=False",
+            stacklevel=3,
+        )
+        return env, None
     file = None if isinstance(source_model, SAC) else statistics_beside(sac, source_model)
     if file is None:
         return env, None

@@ -12,6 +12,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_rpto.algorithms import zips
 from sb3_rpto.algorithms.normalisation import in_statistics, read_statistics, statistics_beside
 from sb3_rpto.algorithms.slbo import SLBO
 from sb3_rpto.algorithms.warm import load_sac
@@ -78,13 +79,10 @@ def load_policy(path: str | Path, argument: str, statistics: str | Path | None =
 
 
 def _load(path: str | Path, argument: str) -> Policy:
+    zips.look_into(path, argument)
     constant = {"lr_schedule": lambda _: 0.0, "learning_rate": 0.0}
-    try:
-        data, parameters, _ = load_from_zip_file(path, device="cpu", custom_objects=constant)
-    except (ValueError, KeyError) as error:
-        raise ValueError(f"{argument} {str(path)!r} is no zip of a model: {error}") from error
-    if not data or "policy_class" not in data:
-        raise ValueError(f"{argument} {str(path)!r} is no zip of a model of Stable-Baselines3")
+    data, parameters, _ = load_from_zip_file(path, device="cpu", custom_objects=constant)
+    assert data is not None  # it was looked into
     if "trpo.policy" in parameters:  # SLBO acts by TRPO's policy, beside which it keeps SAC's
         return SLBO.load(path, device="cpu")
     kwargs = dict(data.get("policy_kwargs", {}))

@@ -364,6 +364,19 @@ class Problem:
         z = (values[free] - self.null[free]) / self.size[free]
         return reduced.normal.sum(0) + np.diag(pull), reduced.gradient.sum(0) + pull * z
 
+    def bounded_fall(self, linear: Linear, values: np.ndarray) -> float:
+        """How far the cost would fall within the bounds of the free parameters if it were quadratic.
+
+        :param linear: the cost around ``values``, (p,)
+        """
+        free, normal, gradient = linear.free, linear.normal.sum(0), linear.gradient.sum(0)
+        if not len(free):
+            return 0.0
+        damped = normal + 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(free))
+        low, high = ((b[free] - values[free]) / self.size[free] for b in (self.lower, self.upper))
+        z = bounded_step(damped, gradient, np.minimum(low, 0.0), np.maximum(high, 0.0))
+        return float(-2 * gradient @ z - z @ normal @ z)
+
     def linear(self, fit: Fit, free: np.ndarray) -> Linear:
         """The reduced normal equations at a fit, for screening, elimination and intervals."""
         if fit.linear is not None and np.array_equal(fit.linear.free, free):

@@ -283,3 +283,17 @@ def test_a_zip_tells_by_values_that_its_environment_cannot_show(seen, told):
     assert saw_normalised(sac) is told
     sac._last_original_obs = sac._last_obs.copy()
     assert saw_normalised(sac) is None
+
+
+def test_statistics_beside_a_strangers_zip_are_not_read(tmp_path):
+    """They are a pickle, too."""
+    path = zipped(tmp_path, normalised=True)
+    (tmp_path / "vecnormalize.pkl").write_bytes(b"no pickle")
+    with pytest.warns(
+        UserWarning, match="normalised by VecNormalize lie beside it.*leaves unread; pass vec_normalize="
+    ):
+        assert from_zip(path, weights_only=True).get_vec_normalize_env() is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert earned(from_zip(path, weights_only=True, vec_normalize=statistics())) > -40
+        from_zip(path, weights_only=True, vec_normalize=False)

@@ -165,9 +165,9 @@ def test_entropy_coefficient(cls, ent_coef, start):
 
 @every_class
 def test_a_malformed_entropy_coefficient_is_refused(cls):
-    with pytest.raises(ValueError, match="could not convert"):
+    with pytest.raises(ValueError, match=r"could not convert|ent_coef must be"):
         build(cls, ent_coef="otto")
-    with pytest.raises(AssertionError, match="greater than 0"):
+    with pytest.raises((AssertionError, ValueError), match=r"greater than 0|ent_coef must be"):
         build(cls, ent_coef="auto_0.0")
 
 
@@ -190,7 +190,7 @@ def test_as_many_updates_as_steps(cls, train_freq):
 
 @every_class
 def test_a_malformed_train_freq_is_refused(cls):
-    with pytest.raises(ValueError, match="unit of the `train_freq`"):
+    with pytest.raises(ValueError, match=r"unit of the `train_freq`|train_freq must be"):
         build(cls, train_freq=(1, "fortnight"))
     with pytest.raises(ValueError):
         build(cls, train_freq=(1.5, "step"))
@@ -413,7 +413,7 @@ def test_a_policy_may_be_a_class(cls):
         pass
 
     assert type(learn(build(cls, policy=MyPolicy)).policy) is MyPolicy
-    with pytest.raises(ValueError, match="unknown"):
+    with pytest.raises(ValueError, match=r"unknown|policy must be"):
         build(cls, policy="MlpPolice")
 
 
