@@ -198,9 +198,12 @@ class CartPoleDynamics(Dynamics):
 
     def describe(self) -> dict[str, float]:
         """The declared constants by name, in their units."""
-        values = self.values(self.coordinates.detach().double()).tolist()
+        phi = self.coordinates.detach().double()
+        lower, upper = th.tensor([self.bounds[name] for name in self.declared], dtype=th.float64, device=phi.device).T
         # exp(log(bound)) may miss the bound by a rounding error, and a friction of -1e-18 is no world.
-        return {name: min(max(x, self.bounds[name][0]), self.bounds[name][1]) for name, x in zip(self.declared, values)}
+        values = self.values(phi).clamp(lower, upper)
+        values = th.where(phi <= self._lower, lower, th.where(phi >= self._upper, upper, values))
+        return dict(zip(self.declared, values.tolist()))
 
     @th.no_grad()
     def step(self, observations: th.Tensor, actions: th.Tensor, deterministic: bool = False) -> Prediction:

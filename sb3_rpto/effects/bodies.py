@@ -31,7 +31,7 @@ class MassScale(Effect):
 
 @register
 class InertiaScale(Effect):
-    r"""A body whose inertia about its centre is :math:`1 + c` times as much at the same mass: ``body_inertia`` alone.
+    r"""A body whose inertia is :math:`1 + c` times as much at the same mass: MuJoCo's ``body_inertia`` alone.
 
     So it is where masses were changed and inertias were not, as scripts that write ``body_mass`` alone do.
     """
@@ -203,7 +203,7 @@ class GravityTilt(Effect):
     def write(self, world: World, x: np.ndarray) -> None:
         """Turn gravity."""
         gravity = world.field("opt.gravity")
-        gravity[:] = np.einsum("nij,nj->ni", rotations(x[:, 0], x[:, 1]), gravity)
+        gravity[:] = (rotations(x[:, 0], x[:, 1]) * gravity[:, None]).sum(axis=2)
 
 
 @register

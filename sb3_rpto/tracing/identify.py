@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sb3_rpto.dynamics.box import bounded_step, stepped
 from sb3_rpto.effects import Declared, Scales, Simulation
-from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.interpolation import between, interpolate
 from sb3_rpto.tracing.loss import Loss
 from sb3_rpto.tracing.starts import moved, straight
@@ -334,7 +334,7 @@ class Problem:
         moves = np.stack([share * (reduced.move + follow) for share in SHARES])
         trial_starts = np.tile(starts, (len(SHARES), tries, 1, 1))
         trial_starts[..., self.moving] -= moves
-        trial_values = values + steps
+        trial_values = stepped(values, steps, self.lower, self.upper)
         r = self.residuals(
             np.tile(np.repeat(trial_values, count, 0), (len(SHARES), 1)),
             trial_starts.reshape(len(SHARES) * tries * count, -1),
