@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from sb3_rpto.algorithms.answers import Answers, check_finite
 from sb3_rpto.algorithms.listeners import count_in_target
 from sb3_rpto.algorithms.machine import check_machine, check_simulator, doubt, doubt_rules, doubt_what_is_left
-from sb3_rpto.algorithms.normalisation import check_normalisation, normalises, rescaled
+from sb3_rpto.algorithms.normalisation import check_normalisation, normalises, rescaled, sharing
 from sb3_rpto.algorithms.snapshots import PolicySnapshots
 from sb3_rpto.algorithms.source import SourceWorld
 from sb3_rpto.algorithms.worlds import (
@@ -130,7 +130,7 @@ class TwoWorlds(PolicySnapshots):
         if isinstance(env, str):
             env = gym.make(env)
         check_environment(env, "target_env")
-        venv = self._wrap_env(env, self.verbose)
+        venv = sharing(self._wrap_env(env, self.verbose), self.env)
         if self.env is not None:
             self._check_pair(self.env, venv)
         if self.target_env is not None or self._traces_log:  # what the last target told holds for it alone
@@ -220,7 +220,7 @@ class TwoWorlds(PolicySnapshots):
         source = self._wrap_env(env, self.verbose)
         # All that may refuse it comes before anything changes.
         check_for_correct_spaces(source, self.observation_space, self.action_space)
-        check_simulator(source, self.dynamics)
+        check_simulator(source, self.dynamics, self.weighting == "value_aware")
         if self.target_env is not None:
             self._check_pair(source, find_ledger(self.target_env).venv)
         before, after, last_obs = self.get_vec_normalize_env(), unwrap_vec_normalize(source), self._last_obs

@@ -206,7 +206,7 @@ class Resumable(TwoWorlds):
         if model._resume_state.get("learner") is not None:  # set_parameters() has dropped it
             model.snapshots["learner"] = model._resume_state["learner"]
         if model.env is not None:
-            check_simulator(model.env, model.dynamics)
+            check_simulator(model.env, model.dynamics, model.weighting == "value_aware")
             model._bind_rules(model.env, of_target=False)
             had = model._resume_state.get("normalised")
             if had is not None:

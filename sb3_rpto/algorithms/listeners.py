@@ -2,16 +2,23 @@
 
 from collections.abc import Iterator
 
-from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback, StopTrainingOnMaxEpisodes
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    EvalCallback,
+    ProgressBarCallback,
+    StopTrainingOnMaxEpisodes,
+)
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_rpto.algorithms.normalisation import normalises
 from sb3_rpto.algorithms.worlds import members
 
 
-def check_callbacks(callback: BaseCallback, target_env: VecEnv | None) -> None:
-    """Refuse a callback that evaluates in the target that D_target is collected from, or is in the wrong place.
+def check_callbacks(callback: BaseCallback, source: VecEnv | None, target_env: VecEnv | None) -> None:
+    """Refuse a callback that is in the wrong place, or evaluates where it must not.
 
-    The steps of the former would be counted nowhere, and the episode under way would jump.
+    In the target that D_target is collected from its steps would be counted nowhere, and the episode under way would
+    jump. Without the source's normalisation the policy would see other observations there; SB3 fails then in mid-run.
 
     :raises ValueError: naming the callback
     """
@@ -27,6 +34,13 @@ def check_callbacks(callback: BaseCallback, target_env: VecEnv | None) -> None:
             raise ValueError(
                 f"{type(one).__name__} evaluates in target_env itself, so the episode that D_target is collected from "
                 "would jump; give it an environment of its own"
+            )
+        normalised = source is not None and normalises(unwrap_vec_normalize(source))
+        if isinstance(one, EvalCallback) and normalised and unwrap_vec_normalize(one.eval_env) is None:
+            raise ValueError(
+                f"{type(one).__name__}'s environment is in no VecNormalize, and the policy sees observations that "
+                "env's has normalised; give it VecNormalize(eval_env, training=False, norm_reward=False), as with SAC: "
+                "SB3 copies the statistics there"
             )
 
 

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_rpto.algorithms.source import try_source
 from sb3_rpto.dynamics.base import Dynamics, Transitions
 from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants
 from sb3_rpto.dynamics.physical import PhysicalDynamics
@@ -79,7 +80,7 @@ def _check_observations(source: gym.Env, target: gym.Env) -> None:
     """
     copied = copy_env(target)
     wrappers = [layer for layer in layers(copied or target) if isinstance(layer, gym.ObservationWrapper)]
-    if copied is None or not wrappers or not hasattr(copied.unwrapped, "_get_obs"):
+    if copied is None or not wrappers or not all(hasattr(copied.unwrapped, name) for name in ("_get_obs", "data")):
         return  # what cannot be read, or copied, is judged by its errors later: :func:`doubt`
     try:
         recover = state_map(source)
@@ -113,16 +114,18 @@ def _check_observations(source: gym.Env, target: gym.Env) -> None:
         )
 
 
-def check_simulator(source: VecEnv, dynamics: Dynamics | None) -> None:
+def check_simulator(source: VecEnv, dynamics: Dynamics | None, single_steps: bool) -> None:
     """Warn where a new source is another simulator than the one that phi is the numbers of.
 
     :param source: which was set, or with which a checkpoint was loaded
     :param dynamics: which were built from an earlier one
-    :raises ValueError: it does more than its model and phi do, as one that was corrected already
+    :param single_steps: as of :func:`~sb3_rpto.algorithms.source.try_source`
+    :raises ValueError: it does more than its model and phi do, as one that was corrected already; phi cannot act in it
     """
     physical = dynamics.physical if isinstance(dynamics, ResidualDynamics) else dynamics
     if isinstance(physical, PhysicalDynamics):
         check_source(source)
+        try_source(source, dynamics, single_steps)
         model = mujoco_model(single_env(source))
         # Places that nothing acts at are marks, such as a goal's, which a task may move.
         found = [n for n in differing(physical.model, model) if not n.startswith("site_") or sites_act(model)]

@@ -30,6 +30,8 @@ from sb3_rpto.envs.state import reseed, restore_state, save_state, whereabouts
 
 RolloutStart = Literal["target", "source", "mix"]
 
+#: For a trial, phi is moved by so much of its scale: a reset that writes the model's own numbers undoes it.
+NUDGE = 1e-3
 #: A branch from a state that a simulator does not know begins elsewhere, unless so many draws find no other.
 REDRAWN = 100
 
@@ -268,6 +270,28 @@ class SimulatorSource(EpisodeSource):
         if state["simulators"] is not None:
             restore_state(self.env.unwrapped, state["simulators"])
             super().set_state(state)
+
+
+def try_source(env: VecEnv, dynamics: Dynamics | None, single_steps: bool) -> None:
+    """Refuse now what ``learn()`` would refuse: a copy of the source begins an episode with phi in it.
+
+    :param env: the real source; untouched
+    :param dynamics: the trainable source; only simulators of MuJoCo need a copy
+    :param single_steps: whether they are asked for one-step answers, too
+    :raises ValueError: it cannot be copied, phi cannot act in it, or it answers from more than its state
+    """
+    physical = dynamics.physical if isinstance(dynamics, ResidualDynamics) else dynamics
+    if not isinstance(physical, PhysicalDynamics):
+        return
+    if single_steps or physical is not dynamics:
+        physical.attach(env)
+    simulation = physical.simulation
+    moved = np.clip(physical.values + NUDGE * physical.scale, simulation.lower, simulation.upper)
+    phi = [effect.with_values(moved[rows]) for effect, rows in zip(simulation.effects, simulation.slices)]
+    trial = StandingEnv(copied(env), phi)
+    trial.action_space.seed(0)
+    trial.reset(seed=0)
+    trial.step(trial.action_space.sample())
 
 
 def copied(env: VecEnv) -> gym.Env:

@@ -17,12 +17,13 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_rpto.algorithms import arguments, dynamics_arguments, plain_sac, resuming, settings, warm
+from sb3_rpto.algorithms import arguments, dynamics_arguments, normalisation, plain_sac, resuming, settings, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.closing import LoopCloser, trace_log
 from sb3_rpto.algorithms.listeners import check_callbacks
 from sb3_rpto.algorithms.looping import Looping
-from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_world
+from sb3_rpto.algorithms.remembered import doubt_returns
+from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_world, try_source
 from sb3_rpto.algorithms.worlds import check_environment, check_spaces, find_ledger
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.dynamics.base import Dynamics
@@ -234,6 +235,8 @@ class TransferAlgorithm(Looping):
                 dynamics_arguments.check_carried(self.env, self.close_loop)
                 dynamics_arguments.check_rules(self.dynamics_kwargs, self.observation_space, self.action_space)
             self._setup_model()
+            if self.env is not None:
+                try_source(self.env, self.dynamics, self.weighting == "value_aware")
             if target_env is not None:
                 self.set_target_env(target_env)
             if self.measured is not None and isinstance(self.dynamics, PhysicalDynamics):
@@ -299,6 +302,7 @@ class TransferAlgorithm(Looping):
         target_env: GymEnv | str | None = None,
         *,
         source_data: ReplayBuffer | str | pathlib.Path | None = None,
+        vec_normalize: normalisation.Statistics = None,
         weights_only: bool = False,
         **kwargs: Any,
     ) -> Self:
@@ -309,10 +313,12 @@ class TransferAlgorithm(Looping):
         :param target_env: the target
         :param source_data: transitions of the source (buffer, pickle or ``.npz``); D_source starts with them and the
             dynamics' phi_0 is fitted to them, instead of to fresh source steps
+        :param vec_normalize: by which the source model saw observations, or the file that its ``save()`` wrote: ``env``
+            is put into a VecNormalize with these statistics. None: those beside the zip, which is said; False: none
         :param weights_only: read the zip without running a pickle of it, which may do anything: for a stranger's
-            (:func:`~sb3_rpto.algorithms.plain_sac.sac_of_weights`)
+            (:func:`~sb3_rpto.algorithms.plain_sac.sac_of_weights`); statistics beside it are not read, either
         :param kwargs: constructor arguments; they win over the source model's and the preset's
-        :raises ValueError: when the source model's spaces are not the environment's
+        :raises ValueError: when the source model's spaces are not the environment's, or ``vec_normalize`` is not of it
         """
         if isinstance(env, str):
             env = gym.make(env)
@@ -324,10 +330,13 @@ class TransferAlgorithm(Looping):
         else:
             sac = warm.load_sac(source_model, device)
         warm.check_source_spaces(sac, env)
+        env, statistics = normalisation.as_learned(sac, source_model, env, vec_normalize, unpickle=not weights_only)
         given = {**plain_sac.carried_arguments(sac), **kwargs}
         model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **given)
         # "auto" asks for a learned temperature, a number or "auto_0.5" for that one.
         warm.carry_over(sac, model, temperature=kwargs.get("ent_coef", "auto") == "auto")
+        if not normalisation.check_source_model(sac, statistics, model.get_vec_normalize_env()):
+            doubt_returns(sac, env)
         if source_data is not None:
             warm.fill_source(model, source_data)
         return model
@@ -379,7 +388,7 @@ class TransferAlgorithm(Looping):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
-        check_callbacks(callback, self.target_env)
+        check_callbacks(callback, self.env, self.target_env)
         self._source_world = self._source_world or self._make_source_world()
         trace_log(self)  # first of all: the log may be refused
         if not self._warm:

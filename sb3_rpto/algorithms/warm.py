@@ -18,7 +18,6 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_rpto.algorithms import recorded, zips
 from sb3_rpto.algorithms.answers import check_rewards
 from sb3_rpto.algorithms.checkpoint import Resumable
-from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
 from sb3_rpto.algorithms.source import EpisodeSource
 from sb3_rpto.algorithms.update import as_transitions
 from sb3_rpto.buffers import World, load_transitions
@@ -86,9 +85,6 @@ def carry_over(sac: SAC, model: Resumable, temperature: bool = True) -> None:
             "policy is another action now",
             stacklevel=3,
         )
-    if sac.get_env() is not None and sac._last_obs is not None:  # it has learned there; a zip does not tell
-        learned = sac.get_vec_normalize_env()
-        check_normalisation(normalises(learned), model.get_vec_normalize_env(), "source_model", learned)
     try:
         model.policy.load_state_dict(sac.policy.state_dict())
     except RuntimeError as error:
@@ -234,7 +230,9 @@ def _report(model: Resumable, source: EpisodeSource) -> None:
     """Log the source phase in a group of its own and leave a checkpoint where the user gave the logger a folder."""
     for name, value in {"timesteps": model._pretrained_steps, **source.log()}.items():
         model.logger.record(f"pretrain/{name}", value)
-    model.logger.dump(step=0)
+    # As in every row of SB3's: readers of its files draw the rest against this one.
+    model.logger.record("time/total_timesteps", model.num_timesteps, exclude="tensorboard")
+    model.logger.dump(step=model.num_timesteps)
     given = model._custom_logger or model.tensorboard_log is not None or "SB3_LOGDIR" in os.environ
     if given and model.logger.dir is not None:
         folder = pathlib.Path(model.logger.dir)

@@ -14,6 +14,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 
 from sb3_rpto.algorithms.answers import Answers, check_finite
+from sb3_rpto.algorithms.normalisation import share
 from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import layers
 from sb3_rpto.envs.state import accepts_seed, restore_state, save_state, whereabouts
@@ -159,19 +160,8 @@ def share_normalisation(venv: VecEnv, source: VecEnv | None) -> VecEnv:
     statistics = unwrap_vec_normalize(source) if source is not None else None
     if statistics is None:
         return venv
-    shared = VecNormalize(
-        venv,
-        training=False,
-        norm_obs=statistics.norm_obs,
-        norm_reward=statistics.norm_reward,
-        clip_obs=statistics.clip_obs,
-        clip_reward=statistics.clip_reward,
-        gamma=statistics.gamma,
-        epsilon=statistics.epsilon,
-    )
-    if statistics.norm_obs:
-        shared.obs_rms = statistics.obs_rms
-    shared.ret_rms = statistics.ret_rms
+    shared = VecNormalize(venv, training=False, norm_obs=statistics.norm_obs)
+    share(shared, statistics)
     return shared
 
 
@@ -268,10 +258,6 @@ def check_pair(source: VecEnv, target: VecEnv) -> None:
             raise ValueError(
                 f"target_env has {name} {of_target}, env has {of_source}; source and target must share their spaces"
             )
-    if unwrap_vec_normalize(target) is not None:
-        raise ValueError(
-            "target_env is wrapped in VecNormalize; wrap env (the source) alone, the target then shares its statistics"
-        )
 
 
 def check_environment(env: gym.Env | VecEnv, name: str) -> None:

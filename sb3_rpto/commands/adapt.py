@@ -41,6 +41,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("source_model", metavar="ZIP", help="SAC that was trained in the simulator")
     parser.add_argument("env", metavar="ENV", help="id of the simulator: HalfCheetah-v5, package:name/Task-v0")
+    options.add_statistics(parser, "ZIP")
     recordings.add(parser)
     parser.add_argument("--out", metavar="DIR", required=True, type=Path, help="folder of the run; it resumes there")
     parser.add_argument(
@@ -54,9 +55,9 @@ def run(parsed: argparse.Namespace) -> int:
     """Trace and learn, or go on with it."""
     from sb3_rpto import RPTO
     from sb3_rpto.algorithms.arguments import constructor_names
-    from sb3_rpto.commands.policies import check_raw
+    from sb3_rpto.commands.policies import in_saved, save_statistics, say_statistics, statistics_of_source
     from sb3_rpto.commands.progress import Progress, earnings, read_rows
-    from sb3_rpto.commands.runs import RunFolder, beside, load_checkpoint
+    from sb3_rpto.commands.runs import RunFolder, beside, load_checkpoint, statistics_asked
     from sb3_rpto.commands.terminal import lines, say
     from sb3_rpto.effects import Declared
     from sb3_rpto.experiments.sources import digest
@@ -67,7 +68,7 @@ def run(parsed: argparse.Namespace) -> int:
     options.check_positive(parsed, "steps")
     options.check_seed(parsed.seed)
     options.check_file(parsed.source_model, "ZIP")
-    check_raw(parsed.source_model, "RPTO(..., target_data=log) in Python, with the source in its VecNormalize")
+    statistics = statistics_of_source(parsed.source_model, parsed.vec_normalize)
     recordings.check_candidates(parsed.candidates)
     settings = dict(parsed.set)
     options.check_names(settings, constructor_names(RPTO) - GIVEN)
@@ -100,12 +101,14 @@ def run(parsed: argparse.Namespace) -> int:
         "steps": parsed.steps,
         "seed": parsed.seed,
         "settings": dict(parsed.set),
+        **statistics_asked(parsed.out, statistics),
         **({"simulated": True} if parsed.simulated else {}),  # runs of earlier versions do not tell
     }
     folder = RunFolder.open(parsed.out, config)
     if folder.result.exists():
         say(f"adapted already: {folder.model}")
         return 0
+    say_statistics("ZIP", statistics)
     checkpoint = folder.newest_checkpoint()
     model: Any
     if checkpoint is None:
@@ -118,15 +121,17 @@ def run(parsed: argparse.Namespace) -> int:
             close_loop=parsed.candidates or True,
             seed=parsed.seed,
             device=parsed.device,
+            vec_normalize=statistics,
             **settings,
         )
         rows = []
     else:
-        model = load_checkpoint(checkpoint, simulator, device=parsed.device)
+        model = load_checkpoint(checkpoint, in_saved(simulator, checkpoint), device=parsed.device)
         rows = read_rows(checkpoint)
     model.loop.progress = None if parsed.quiet else lines()
     progress = Progress(folder, parsed.steps, rows, parsed.quiet)
     model.learn(parsed.steps - model.num_timesteps, callback=progress, reset_num_timesteps=checkpoint is None)
+    save_statistics(folder.path, model)
     write_atomically(folder.model, model.save)
     folder.finish(progress.rows)
     say(f"{earnings(model.loop)}; written: {folder.model}")

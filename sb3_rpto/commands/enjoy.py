@@ -73,6 +73,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--video", metavar="FILE", type=Path, help="write a film: .mp4 or .gif")
     parser.add_argument("--seconds", metavar="S", type=float, default=10.0, help="of the film at most (default: 10)")
     parser.add_argument("--source-model", metavar="ZIP", help="agent of the source, for the film (default: the run's)")
+    options.add_statistics(parser, "MODEL")
     parser.add_argument("--source", metavar="ID", help="id of the source, for the film (default: likewise)")
     parser.set_defaults(run=run)
 
@@ -82,7 +83,8 @@ def run(parsed: argparse.Namespace) -> int:
     import numpy as np
     from stable_baselines3.common.utils import set_random_seed
 
-    from sb3_rpto.commands.policies import load_policy, statistics_of
+    from sb3_rpto.algorithms.normalisation import statistics_of
+    from sb3_rpto.commands.policies import load_policy, say_statistics, statistics_named
 
     options.check_positive(parsed, "episodes")
     options.check_seed(parsed.seed)
@@ -90,10 +92,10 @@ def run(parsed: argparse.Namespace) -> int:
         raise ValueError(f"--seconds is {parsed.seconds:g}; give a time above 0")
     model, known = _model(parsed.model)
     target = _target(parsed, known)
-    policy = load_policy(model, "MODEL")
-    statistics = statistics_of(model)
-    if statistics is not None:
-        print(f"sb3-rpto: MODEL saw observations normalised by {statistics}, here it sees them raw", file=sys.stderr)
+    named = statistics_named(parsed.vec_normalize)
+    statistics = (statistics_of(model) if named is None else named) or None
+    policy = load_policy(model, "MODEL", statistics)
+    say_statistics("MODEL", statistics)
     _check_spaces(policy, target, "MODEL", "TARGET")
     beside = _to_film(parsed, known, target) if parsed.video is not None else None
 
@@ -149,8 +151,9 @@ def _to_film(
 
     All that can fail does so here, before anything is run.
     """
+    from sb3_rpto.algorithms.normalisation import statistics_of
     from sb3_rpto.commands import video
-    from sb3_rpto.commands.policies import load_policy
+    from sb3_rpto.commands.policies import load_policy, say_statistics
     from sb3_rpto.zoo.settings import source_of
 
     video.require(parsed.video)
@@ -164,7 +167,11 @@ def _to_film(
             raise ValueError(f"TARGET {target.name!r} is none of our targets: pass the source's id by --source ID")
         options.check_file(agent, "--source-model")
         source = options.world(name, "--source")
-        found = load_policy(agent, "--source-model"), source
+        # A run knows by what its agent sees.
+        of_run = parsed.source_model is None and "source_model" in known
+        statistics = _statistics_of_run(parsed.model, known) if of_run else statistics_of(agent)
+        found = load_policy(agent, "--source-model", statistics), source
+        say_statistics("--source-model", statistics)
         _check_spaces(found[0], source, "--source-model", "--source")
     elif parsed.source is not None:
         raise ValueError("--source is the world of the source policy: pass its zip by --source-model, too")
@@ -197,6 +204,13 @@ def _agent_of(folder: Path, known: dict[str, Any]) -> str | None:
     if known.get("source_model_sha256") not in (None, digest(found[0])):
         raise ValueError(f"{found[0]} is another agent than the run began with; pass that one's zip by --source-model")
     return str(found[0])
+
+
+def _statistics_of_run(folder: Path, known: dict[str, Any]) -> Path | None:
+    """The statistics by which the source agent of a run saw observations, where the run was told."""
+    named = known.get("vec_normalize")
+    found = [] if named is None else [path for path in (folder / named, Path(named)) if path.is_file()]
+    return found[0] if found else None
 
 
 def _check_spaces(policy: Policy, world: options.World, argument: str, of: str) -> None:

@@ -18,6 +18,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import gymnasium as gym
 
+#: Names the statistics by which an agent sees observations.
+STATISTICS = "--vec-normalize"
+
 
 def add_common(parser: argparse.ArgumentParser, of_target: str = "") -> None:
     """Options of commands that train and evaluate: how long, how often it is judged, and the settings.
@@ -48,6 +51,20 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--device", type=device, default="auto", help="cpu, cuda or auto (default)")
     parser.add_argument("--quiet", action="store_true", help="print the result alone")
+
+
+def add_statistics(parser: argparse.ArgumentParser, of: str) -> None:
+    """The option that names an agent's statistics.
+
+    :param parser: of the command
+    :param of: the agent's argument
+    """
+    parser.add_argument(
+        STATISTICS,
+        metavar="FILE",
+        help=f"statistics of VecNormalize by which {of} sees observations (default: vecnormalize.pkl beside it, if "
+        "there is one; 'none': it sees raw ones)",
+    )
 
 
 def device(text: str) -> str:

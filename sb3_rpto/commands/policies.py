@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_rpto.algorithms import zips
+from sb3_rpto.algorithms.normalisation import in_statistics, read_statistics, statistics_beside
 from sb3_rpto.algorithms.slbo import SLBO
+from sb3_rpto.algorithms.warm import load_sac
+from sb3_rpto.commands import options
+from sb3_rpto.files import write_atomically
+
+#: The file that commands leave beside a zip, as the zoo does.
+STATISTICS = "vecnormalize.pkl"
 
 
 class Policy(Protocol):
@@ -31,13 +41,44 @@ class Policy(Protocol):
         ...
 
 
-def load_policy(path: str | Path, argument: str) -> Policy:
+class NormalisedPolicy:
+    """A policy that sees observations by the statistics of a VecNormalize.
+
+    :param policy: that acts
+    :param statistics: by which it has learned
+    """
+
+    def __init__(self, policy: Policy, statistics: VecNormalize) -> None:
+        self.policy, self.statistics = policy, statistics
+        self.observation_space, self.action_space = policy.observation_space, policy.action_space
+
+    def predict(self, observation: Any, state: Any = None, *, deterministic: bool = False) -> tuple[np.ndarray, Any]:
+        """The action for a raw observation; see :class:`Policy`."""
+        raw = observation if isinstance(observation, dict) else np.asarray(observation)
+        return self.policy.predict(self.statistics.normalize_obs(raw), state, deterministic=deterministic)
+
+
+def load_policy(path: str | Path, argument: str, statistics: str | Path | None = None) -> Policy:
     """Build the policy alone: no environment, buffers or model of the source are needed.
 
     :param path: of the zip
     :param argument: what the user passed it as
-    :raises ValueError: for a file that is no model of SB3's
+    :param statistics: file of those by which it sees observations; None: it sees raw ones
+    :raises ValueError: for a file that is no model of SB3's, or holds no statistics of its observations
     """
+    policy = _load(path, argument)
+    if statistics is None:
+        return policy
+    found = read_statistics(statistics, options.STATISTICS)
+    if found.observation_space.shape != policy.observation_space.shape:
+        raise ValueError(
+            f"{options.STATISTICS} {str(statistics)!r} is of observations {found.observation_space}, {argument} has "
+            f"{policy.observation_space}; name the file that was saved with it"
+        )
+    return NormalisedPolicy(policy, found)
+
+
+def _load(path: str | Path, argument: str) -> Policy:
     zips.look_into(path, argument)
     constant = {"lr_schedule": lambda _: 0.0, "learning_rate": 0.0}
     data, parameters, _ = load_from_zip_file(path, device="cpu", custom_objects=constant)
@@ -53,29 +94,53 @@ def load_policy(path: str | Path, argument: str) -> Policy:
     return policy
 
 
-def check_raw(path: str | Path, instead: str) -> None:
-    """Refuse an agent that saw normalised observations, as far as the files beside its zip tell.
+def statistics_named(given: str | None) -> str | Literal[False] | None:
+    """What the option says: a file, False for 'none', or None where nothing is said.
 
-    :param path: of the zip
-    :param instead: what to use for such an agent
-    :raises ValueError: naming the statistics
+    :raises FileNotFoundError: there is no such file
+    :raises ValueError: it holds no statistics
     """
-    statistics = statistics_of(path)
-    if statistics is not None:
-        raise ValueError(
-            f"ZIP {str(path)!r} saw observations normalised by {statistics}, which this command cannot: use {instead}"
-        )
+    if given is None:
+        return None
+    if given.lower() == "none":
+        return False
+    options.check_file(given, options.STATISTICS)
+    read_statistics(given, options.STATISTICS)
+    return given
 
 
-def statistics_of(path: str | Path) -> Path | None:
-    """The statistics of VecNormalize that the zoo or SB3's callbacks left with a zip; None where there are none.
+def statistics_of_source(path: str, given: str | None) -> str | Literal[False] | None:
+    """The statistics by which a source agent saw observations: those named, else those beside its zip.
 
-    :param path: of the zip
+    :param path: of the zip of a SAC
+    :param given: what the option says
+    :return: False: 'none' was said; None: there are none
     """
-    path = Path(path)
-    prefix, _, steps = path.stem.removesuffix("_steps").rpartition("_")
-    # The zoo's, those of SB3's CheckpointCallback, and those that docs/checkpoints.md saves.
-    own = ("vecnormalize.pkl", f"{prefix}_vecnormalize_{steps}_steps.pkl", "statistics.pkl")
-    zoo = (file for file in path.parent.glob("*/vecnormalize.pkl") if file.with_name("args.yml").is_file())
-    found = (*(path.with_name(name) for name in own), *zoo)
-    return next((file for file in found if file.is_file()), None)
+    named = statistics_named(given)
+    if named is not None:
+        return named
+    found = statistics_beside(load_sac(path, "cpu"), path)
+    return None if found is None else str(found)
+
+
+def say_statistics(argument: str, statistics: str | Path | Literal[False] | None) -> None:
+    """Say by what an agent sees, where it is not what the world shows."""
+    if statistics:
+        print(f"sb3-rpto: {argument} sees observations normalised by {statistics}", file=sys.stderr)
+
+
+def save_statistics(folder: Path, model: Any) -> None:
+    """Leave the statistics by which a model sees observations in a folder, where it does, for its zip.
+
+    :param folder: in which the zip is
+    :param model: of SB3's or ours
+    """
+    normaliser = model.get_vec_normalize_env()
+    if normaliser is not None:
+        write_atomically(folder / STATISTICS, lambda file: normaliser.save(str(file)), suffix="pkl")
+
+
+def in_saved(env: GymEnv, folder: Path) -> GymEnv:
+    """``env`` in the statistics that :func:`save_statistics` left in a folder, where there are some."""
+    file = folder / STATISTICS
+    return in_statistics(env, file, str(file)) if file.is_file() else env

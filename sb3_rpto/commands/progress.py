@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_rpto.commands.policies import save_statistics
 from sb3_rpto.commands.runs import CURVE, RunFolder, class_name
 from sb3_rpto.commands.terminal import say
 from sb3_rpto.files import write_text
@@ -75,6 +76,7 @@ class Progress(BaseCallback):
     def _write(self, folder: Path) -> None:
         self.model.save(folder / "model.zip")
         self.model.save_replay_buffer(folder / "replay_buffer.pkl")  # type: ignore[attr-defined]
+        save_statistics(folder, self.model)
         state = {"class": class_name(self.model), "rows": self.rows}
         write_text(folder / CURVE, json.dumps(state))
 

@@ -11,14 +11,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
+from sb3_rpto.commands.policies import STATISTICS, save_statistics
 from sb3_rpto.commands.terminal import lines
 from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
+from sb3_rpto.experiments.sources import digest
 from sb3_rpto.files import plain, write_json, write_text
 
 if TYPE_CHECKING:
@@ -49,6 +51,11 @@ class RunFolder:
     def replay_buffer(self) -> Path:
         """What it has learned from."""
         return self.path / "replay_buffer.pkl"
+
+    @property
+    def statistics(self) -> Path:
+        """By which the model sees observations; only there where it does."""
+        return self.path / STATISTICS
 
     @property
     def result(self) -> Path:
@@ -101,7 +108,7 @@ class RunFolder:
 
     def _check_ours(self) -> None:
         if self.begun() is None:
-            for kept in (self.config, self.model, self.replay_buffer, self.result, self.checkpoints):
+            for kept in (self.config, self.model, self.statistics, self.replay_buffer, self.result, self.checkpoints):
                 if kept.exists():
                     raise ValueError(
                         f"--out {self.path} holds a {kept.name} that no run of ours wrote; give another folder"
@@ -161,10 +168,17 @@ def beside(folder: Path, file: str | None) -> str | None:
     return None if file is None else os.path.relpath(Path(file).resolve(), folder.resolve())
 
 
+def statistics_asked(folder: Path, statistics: str | Literal[False] | None) -> dict[str, Any]:
+    """The entries of a run's configuration for its source agent's statistics; none where there are none."""
+    if not statistics:
+        return {}
+    return {"vec_normalize": beside(folder, statistics), "vec_normalize_sha256": digest(statistics)}
+
+
 def _same_file(folder: Path, begun: dict[str, Any], asked: dict[str, Any], name: str) -> bool:
     """Whether a run was begun with the same file by a path from where its command was given."""
     before, now = begun.get(name), asked.get(name)
-    if name not in ("source_model", "source_data") or before is None or now is None:
+    if name not in ("source_model", "source_data", "vec_normalize") or before is None or now is None:
         return False
     return Path(before).resolve() == (folder / now).resolve()
 
@@ -294,6 +308,7 @@ class SavedCurve(LearningCurve):
             self.model.save(folder / "model.zip")
             if getattr(self.model, "replay_buffer", None) is not None:
                 self.model.save_replay_buffer(folder / "replay_buffer.pkl")  # type: ignore[attr-defined]
+            save_statistics(folder, self.model)
             write_text(folder / CURVE, json.dumps(state))
 
         self.run.save_checkpoint(self.num_timesteps, write)

@@ -6,7 +6,7 @@ import argparse
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from sb3_rpto.commands import options, recordings
 from sb3_rpto.commands.terminal import say
@@ -63,13 +63,15 @@ def add(commands: Any) -> None:
         metavar="FILE",
         help="source transitions: replay_buffer.pkl or .npz (default: fresh ones)",
     )
+    options.add_statistics(parser, "ZIP")
     options.add_common(parser, of_target="target ")
     parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:
     """Transfer, or go on with it."""
-    from sb3_rpto.commands.runs import RunFolder, SavedCurve, beside
+    from sb3_rpto.commands.policies import save_statistics, say_statistics, statistics_of_source
+    from sb3_rpto.commands.runs import RunFolder, SavedCurve, beside, statistics_asked
     from sb3_rpto.experiments.methods import REGISTRY, Run
     from sb3_rpto.experiments.sources import digest
     from sb3_rpto.files import write_atomically
@@ -90,7 +92,9 @@ def run(parsed: argparse.Namespace) -> int:
     budget = shipped_settings(parsed.method if parsed.method in ALGORITHMS else "rpto", target.env_id)["n_timesteps"]
     steps = parsed.steps or budget
     _check_settings(parsed.method, settings, steps)
-    _check_worlds(parsed, source, target)
+    learns_anew = parsed.method == "sac"
+    statistics = None if learns_anew else statistics_of_source(parsed.source_model, parsed.vec_normalize)
+    _check_worlds(parsed, source, target, statistics)
     if settings.get("close_loop", False) is not False:  # an empty list traces, too
         figures.require()
         recordings.check_out(parsed.out, source.make())
@@ -109,6 +113,7 @@ def run(parsed: argparse.Namespace) -> int:
         "source_data_sha256": None if parsed.source_data is None else digest(parsed.source_data),
         "every": every,
         "episodes": parsed.episodes,
+        **statistics_asked(parsed.out, statistics),
     }
     folder = RunFolder.open(parsed.out, config)
     if folder.result.exists():
@@ -124,7 +129,9 @@ def run(parsed: argparse.Namespace) -> int:
         source_data=parsed.source_data,
         kwargs=settings,
         device=parsed.device,
+        vec_normalize=statistics,
     )
+    say_statistics("ZIP", statistics)
     curve = SavedCurve(
         folder,
         given.make_target,
@@ -142,6 +149,7 @@ def run(parsed: argparse.Namespace) -> int:
     else:
         _go_on(checkpoint, given, curve)
     curve.env.close()
+    save_statistics(folder.path, curve.judged)
     write_atomically(folder.model, curve.judged.save)
     rows = [{"method": parsed.method, "seed": parsed.seed, **row} for row in curve.rows]
     folder.finish(rows)
@@ -187,17 +195,24 @@ def _check_settings(method: str, settings: dict[str, Any], steps: int) -> None:
         raise ValueError(f"--set learning_starts: --method {method} takes no random steps; leave it out")
 
 
-def _check_worlds(parsed: argparse.Namespace, source: options.World, target: options.World) -> None:
-    """Refuse what would fail later: an agent, a source or transitions of another task.
+def _check_worlds(
+    parsed: argparse.Namespace,
+    source: options.World,
+    target: options.World,
+    statistics: str | Literal[False] | None,
+) -> None:
+    """Refuse what would fail later: an agent, a source, transitions or statistics of another task.
+
+    Algorithms of ours tell by themselves of an agent that sees other observations than it has; for others it is done
+    here.
 
     :raises ValueError: naming the argument
     """
     from sb3_rpto.algorithms.warm import load_sac
     from sb3_rpto.buffers import load_transitions
-    from sb3_rpto.commands.policies import check_raw
     from sb3_rpto.experiments.methods import REGISTRY
+    from sb3_rpto.zoo.settings import ALGORITHMS
 
-    check_raw(parsed.source_model, "python -m sb3_rpto.zoo.train, or VecNormalize in Python")
     sac = load_sac(parsed.source_model, "cpu")
     for argument, world in (("TARGET", target), ("--source", source)):
         env = world.make()
@@ -208,6 +223,8 @@ def _check_worlds(parsed: argparse.Namespace, source: options.World, target: opt
                     f"ZIP {parsed.source_model!r} has {name} {of_agent}, {argument} {of_world}; name its task's agent"
                 )
         env.close()
+    if statistics or parsed.method not in (*ALGORITHMS, "sac"):
+        _doubt_agent(sac, source, statistics, told=parsed.method in ALGORITHMS)
     if parsed.source_data is None or not REGISTRY[parsed.method].takes_source_data:
         return
     try:
@@ -218,6 +235,29 @@ def _check_worlds(parsed: argparse.Namespace, source: options.World, target: opt
         found, expected = data[name][0].size, math.prod(space.shape or ())
         if found != expected:
             raise ValueError(f"--source-data holds {name} of {found} numbers, the agent's have {expected}")
+
+
+def _doubt_agent(sac: Any, source: options.World, statistics: str | Literal[False] | None, told: bool) -> None:
+    """Warn of an agent that would see other observations than it has, as far as its zip tells.
+
+    :param sac: the agent
+    :param source: its world
+    :param statistics: by which it is to see
+    :param told: whether that is said elsewhere
+    :raises ValueError: statistics of other observations
+    """
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from sb3_rpto.algorithms.normalisation import check_source_model, in_statistics
+    from sb3_rpto.algorithms.remembered import doubt_returns
+
+    env: Any = source.make()
+    if statistics:
+        env = in_statistics(env, statistics, options.STATISTICS)
+    seen = env if isinstance(env, VecNormalize) else None
+    if not told and not check_source_model(sac, seen, seen):
+        doubt_returns(sac, env)
+    env.close()
 
 
 def _known_settings(method: str) -> set[str]:
@@ -248,12 +288,13 @@ def _go_on(checkpoint: Path, given: Run, curve: SavedCurve) -> None:
     from stable_baselines3.common.env_util import make_vec_env
 
     from sb3_rpto.algorithms.transfer import TransferAlgorithm
+    from sb3_rpto.commands.policies import in_saved
     from sb3_rpto.commands.runs import algorithm_of, load_checkpoint
 
     if issubclass(algorithm_of(checkpoint), TransferAlgorithm):
-        source = make_vec_env(given.make_source, n_envs=given.n_source_envs)
+        source = in_saved(make_vec_env(given.make_source, n_envs=given.n_source_envs), checkpoint)
         model = load_checkpoint(checkpoint, source, given.device, target_env=given.make_target())
     else:
-        model = load_checkpoint(checkpoint, given.make_target(), given.device)
+        model = load_checkpoint(checkpoint, in_saved(given.make_target(), checkpoint), given.device)
     curve.restore(checkpoint)
     model.learn(given.budget - model.num_timesteps, callback=curve, reset_num_timesteps=False)

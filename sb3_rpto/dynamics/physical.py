@@ -26,7 +26,7 @@ from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.copies import copy_env
-from sb3_rpto.envs.observations import StateMap, are_known, noise_of_each, single_env, whole_state
+from sb3_rpto.envs.observations import StateMap, are_known, env_name, noise_of_each, single_env, whole_state
 from sb3_rpto.envs.steps import place_as_after_a_step
 from sb3_rpto.ranges import NOT_NEGATIVE, POSITIVE, THREADS, check, of_type, whole
 
@@ -270,11 +270,18 @@ class PhysicalDynamics(Dynamics):
     def attach(self, env: gym.Env | VecEnv) -> None:
         """Give the environment whose rewards, terminations and observations :meth:`step` answers with; it is copied.
 
-        :raises ValueError: it cannot be copied, or its answer to a step does not follow from the state before it
+        :raises ValueError: it cannot be copied, or set to a state, or its answer to a step does not follow from the
+            state before it
         """
         twin = copy_env(single_env(env))
         if twin is None:
             raise ValueError(f"{env} cannot be copied; give dynamics='physical' an environment that can")
+        for name in ("set_state", "_get_obs"):
+            if not callable(getattr(twin.unwrapped, name, None)):
+                raise ValueError(
+                    f"{env_name(twin)} has no {name}(), by which single steps begin in recorded states; derive it from "
+                    "gymnasium.envs.mujoco.MujocoEnv, or use dynamics='physical' without weighting='value_aware'"
+                )
         check_memoryless(single_env(env), self.recover)
         twin.reset(seed=0)
         self._twin = StandingEnv(twin, self.effects())

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.model import differing, load_model
-from sb3_rpto.effects.wrapper import beyond_model
+from sb3_rpto.effects.wrapper import beyond_model, stepped_by
 from sb3_rpto.envs.observations import (
     StateMap,
     env_name,
@@ -47,12 +47,13 @@ def check_source(env: gym.Env | VecEnv) -> StateMap:
     """Require that an environment does what its model and phi do, and nothing else; the map to its states.
 
     :param env: with all its wrappers; of a VecEnv the first
-    :raises ValueError: no MuJoCo model, states that cannot be recovered from observations or are not what these are
-        read as, actions that are not the commands of the actuators, steps that are more than their simulation, several
-        models
+    :raises ValueError: no MuJoCo model, or none of gymnasium's environments around it, states that cannot be recovered
+        from observations or are not what these are read as, actions that are not the commands of the actuators, steps
+        that are more than their simulation, several models
     """
     single = single_env(env)
     mujoco_model(single)  # what is no MuJoCo task is told first
+    stepped_by(single)
     recover = state_map(single)
     check_commands(single, "dynamics='physical'")
     check_alike(env)
@@ -63,16 +64,16 @@ def check_source(env: gym.Env | VecEnv) -> StateMap:
             "lack, or have twice; give the environment without them, and them as dynamics_kwargs={'effects': [...]} (a "
             "closed loop takes them for known)"
         )
-    frame_skip = getattr(single.unwrapped, "frame_skip", None)
-    if frame_skip is None:
-        raise ValueError(f"{env_name(single)} has no frame_skip; derive it from gymnasium.envs.mujoco.MujocoEnv")
+    lacking = [name for name in ("frame_skip", "dt") if not hasattr(single.unwrapped, name)]
+    if lacking:
+        raise ValueError(f"{env_name(single)} has no {lacking[0]}; derive it from gymnasium.envs.mujoco.MujocoEnv")
     drawn = drawn_numbers(single)
     if drawn:
         raise ValueError(
             f"{env_name(single)}: reset() draws {', '.join(drawn[:3])}, and what it writes undoes phi; let its model "
             "stay, and give dynamics_kwargs={'randomise': 1.0} for episodes that differ"
         )
-    check_step(single, int(frame_skip))
+    check_step(single, int(single.unwrapped.frame_skip))  # type: ignore[attr-defined]
     check_states(single, recover)
     return recover
 

@@ -79,7 +79,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
     def __init__(self, env: gym.Env, effects: Sequence[Effect]) -> None:
         RecordConstructorArgs.__init__(self, effects=effects)
         gym.Wrapper.__init__(self, env)
-        base, self._seam = _steps(env)
+        base, self._seam = stepped_by(env)
         self._world = LiveWorld(base.model, base.data)
         self.effects: list[Effect] = []
         self._commanding: list[tuple[Effect, np.ndarray]] = []
@@ -373,8 +373,11 @@ def beyond_model(env: gym.Env) -> list[str]:
     return sorted({effect.label for effect, _ in pairs})
 
 
-def _steps(env: gym.Env) -> tuple[Any, str]:
-    """The innermost environment and the name of the method that steps its physics."""
+def stepped_by(env: gym.Env) -> tuple[Any, str]:
+    """The innermost environment and the name of the method that steps its physics.
+
+    :raises ValueError: it is none of gymnasium's MuJoCo environments, so effects have no place to act
+    """
     base: Any = env.unwrapped
     seam = next((name for name in _SEAMS if callable(getattr(base, name, None))), None)
     mine = isinstance(getattr(base, "model", None), mujoco.MjModel) and isinstance(

@@ -6,7 +6,6 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -95,7 +94,7 @@ def check_step_by_step(settings: Mapping[str, Any]) -> None:
 
 
 def source_transitions(
-    source_model: str | pathlib.Path, source: gym.Env, seed: int, source_data: Any = None
+    source_model: str | pathlib.Path, source: GymEnv, seed: int, source_data: Any = None
 ) -> tuple[dict[str, np.ndarray], int]:
     """Transitions of the source, for methods that need some: those given, else fresh ones of the source policy.
 
@@ -118,7 +117,7 @@ def source_transitions(
 
 def with_more_critics(
     source_model: str | pathlib.Path,
-    target: gym.Env,
+    target: GymEnv,
     seed: int,
     n_critics: int,
     data: dict[str, np.ndarray],
@@ -152,7 +151,8 @@ def with_more_critics(
     if model.log_ent_coef is not None and source.log_ent_coef is not None:
         model.log_ent_coef.data.copy_(source.log_ent_coef.data)
         begin_temperature(model, settings.get("ent_coef"))
-    inputs = th.as_tensor(np.concatenate([data["observations"], data["actions"]], axis=1), device=model.device).float()
+    seen = _as_seen(data["observations"], model)
+    inputs = th.as_tensor(np.concatenate([seen, data["actions"]], axis=1), device=model.device).float()
     for i, network in enumerate(model.critic.q_networks):
         teacher = old[i % len(old)]
         if i < len(old):
@@ -163,6 +163,12 @@ def with_more_critics(
         regress(network, th.optim.Adam(network.parameters(), lr=1e-3), inputs, goals, CRITIC_STEPS)
     model.critic_target.load_state_dict(model.critic.state_dict())
     return model
+
+
+def _as_seen(observations: np.ndarray, model: Any) -> np.ndarray:
+    """Raw observations as a model sees them."""
+    normaliser = model.get_vec_normalize_env()
+    return observations if normaliser is None else np.asarray(normaliser.normalize_obs(observations))
 
 
 def check_critics(source: SAC, n_critics: int) -> None:
@@ -199,7 +205,7 @@ class MixedReplayBuffer(DualReplayBuffer):
 
 def mixed_sac(
     source_model: str | pathlib.Path,
-    target: gym.Env,
+    target: GymEnv,
     seed: int,
     data: dict[str, np.ndarray],
     device: str = "cpu",
@@ -257,7 +263,7 @@ def trpo_steps(budget: int, n_steps: int | None) -> int:
 
 def cloned_trpo(
     source_model: str | pathlib.Path,
-    target: gym.Env,
+    target: GymEnv,
     seed: int,
     budget: int,
     states: np.ndarray,
@@ -270,7 +276,7 @@ def cloned_trpo(
     :param target: the target
     :param seed: of the run
     :param budget: target steps, a multiple of ``n_steps``; by default 2048, for small budgets a quarter
-    :param states: of the source, (n, observation_dim)
+    :param states: of the source, raw, (n, observation_dim)
     :param device: to learn on
     :param settings: arguments of TRPO
     :raises ValueError: for a budget that is no multiple of ``n_steps``: TRPO would overspend it
@@ -285,7 +291,7 @@ def cloned_trpo(
         "policy_kwargs": clone_kwargs(teacher),
     }
     model = TRPO(SquashedMeanPolicy, target, n_steps=n_steps, seed=seed, device=device, **{**defaults, **settings})
-    clone(model.policy, teacher, states)
+    clone(model.policy, teacher, _as_seen(states, model))
     return model
 
 

@@ -13,6 +13,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_rpto.algorithms.worlds import share_normalisation
+
 MakeEnv = Callable[[], gym.Env]
 #: Evaluation environments are seeded apart from both worlds.
 EVALUATION_SEED = 50_000
@@ -61,12 +63,16 @@ class LearningCurve(BaseCallback):
         """Add a row."""
         row = {
             "steps": steps,
-            "return": evaluate(model, self.env, self.n_episodes, self.seed),
+            "return": evaluate(model, self._as_seen_by(model), self.n_episodes, self.seed),
             "updates": model._n_updates - self._updates_at_start,
             "source_steps": self.source_steps + getattr(model, "source_timesteps", 0),
             "seconds": round(self._spent, 2),
         }
         self.rows.append({**row, **(self.read(model) if self.read else {})})
+
+    def _as_seen_by(self, model: SAC) -> VecEnv:
+        """The evaluation environment with the statistics by which the model sees observations."""
+        return share_normalisation(self.env, model.get_env())
 
     def begin(self, model: SAC) -> None:
         """The row of the policy as it comes, before the first target step."""

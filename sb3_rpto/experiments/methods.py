@@ -6,14 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms import RPO, RPTO, RTO
 from sb3_rpto.algorithms.distil import clone_kwargs
 from sb3_rpto.algorithms.mbpo import MBPO
+from sb3_rpto.algorithms.normalisation import in_statistics
 from sb3_rpto.algorithms.pdml import PDML
 from sb3_rpto.algorithms.ptp import PTP
 from sb3_rpto.algorithms.slbo import SLBO
@@ -28,6 +31,8 @@ from sb3_rpto.presets import resolve_preset
 class Run:
     """What a method is given; see :func:`~sb3_rpto.experiments.run.transfer`.
 
+    :param vec_normalize: file of the statistics by which the source model sees observations; False: it sees raw ones;
+        None: algorithms of ours look beside its zip
     :param device: to learn on; runs side by side are quickest on the CPU
     :param models: folder where fits of networks to the source are kept, for the runs that begin alike
     """
@@ -42,6 +47,19 @@ class Run:
     kwargs: dict[str, Any] = field(default_factory=dict)
     device: str = "cpu"
     models: Path | None = None
+    vec_normalize: str | Literal[False] | None = None
+
+    def source(self, n_envs: int = 1) -> VecEnv:
+        """The source as the source model sees it."""
+        return self.seen(make_vec_env(self.make_source, n_envs=n_envs))  # type: ignore[return-value]  # as passed
+
+    def target(self) -> GymEnv:
+        """The target as the source model sees it."""
+        return self.seen(self.make_target())
+
+    def seen(self, env: GymEnv) -> GymEnv:
+        """An environment in the statistics by which the source model sees observations, if there are some."""
+        return in_statistics(env, self.vec_normalize) if self.vec_normalize else env
 
     def source_id(self) -> str | None:
         """The source's id, None where it has none."""
@@ -52,7 +70,9 @@ class Run:
 
     def source_transitions(self, curve: LearningCurve) -> dict[str, Any]:
         """Transitions of the source; what fresh ones cost is in the curve's source steps."""
-        data, spent = baselines.source_transitions(self.source_model, self.make_source(), self.seed, self.source_data)
+        data, spent = baselines.source_transitions(
+            self.source_model, self.seen(self.make_source()), self.seed, self.source_data
+        )
         curve.source_steps += spent
         return data
 
@@ -72,13 +92,14 @@ class Method:
 
 
 def _zero_shot(run: Run, curve: LearningCurve) -> None:
-    curve.begin(baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, **run.kwargs))
+    curve.begin(baselines.fine_tuned_sac(run.source_model, run.target(), run.seed, run.device, **run.kwargs))
 
 
 def two_worlds(cls: type[TransferAlgorithm], run: Run, curve: LearningCurve) -> None:
     """Algorithms over a source and a target, warm-started from the source model."""
+    # Its own statistics: from_source() wraps the source, and the target shares them.
     source, kwargs = make_vec_env(run.make_source, n_envs=run.n_source_envs), dict(run.kwargs)
-    kwargs["source_data"] = run.source_data
+    kwargs |= {"source_data": run.source_data, "vec_normalize": run.vec_normalize}
     model = cls.from_source(run.source_model, source, run.make_target(), seed=run.seed, device=run.device, **kwargs)
     if run.models is not None:
         fit_once(model, run.models)
@@ -97,7 +118,7 @@ def _sac(run: Run, curve: LearningCurve) -> None:
 
 
 def _sac_warm(run: Run, curve: LearningCurve) -> None:
-    model = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, **run.kwargs)
+    model = baselines.fine_tuned_sac(run.source_model, run.target(), run.seed, run.device, **run.kwargs)
     model.learn(run.budget, callback=curve)
 
 
@@ -105,19 +126,19 @@ def _sac_warm_high(run: Run, curve: LearningCurve) -> None:
     settings = {"gradient_steps": _rpto_updates(run.source_id()), **run.kwargs}
     n_critics = settings.pop("n_critics", None)
     if n_critics is None:
-        model = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, **settings)
+        model = baselines.fine_tuned_sac(run.source_model, run.target(), run.seed, run.device, **settings)
     else:
         baselines.check_critics(SAC.load(run.source_model, device="cpu"), n_critics)
         data = run.source_transitions(curve)
         model = baselines.with_more_critics(
-            run.source_model, run.make_target(), run.seed, n_critics, data, run.device, **settings
+            run.source_model, run.target(), run.seed, n_critics, data, run.device, **settings
         )
     model.learn(run.budget, callback=curve)
 
 
 def _sac_mixed(run: Run, curve: LearningCurve) -> None:
     data = run.source_transitions(curve)
-    model = baselines.mixed_sac(run.source_model, run.make_target(), run.seed, data, run.device, **run.kwargs)
+    model = baselines.mixed_sac(run.source_model, run.target(), run.seed, data, run.device, **run.kwargs)
     model.learn(run.budget, callback=curve)
 
 
@@ -126,7 +147,7 @@ def _trpo_warm(run: Run, curve: LearningCurve) -> None:
     clone_kwargs(SAC.load(run.source_model, device="cpu"))  # what cannot be cloned shows before states are collected
     states = run.source_transitions(curve)["observations"]
     model = baselines.cloned_trpo(
-        run.source_model, run.make_target(), run.seed, run.budget, states, run.device, **run.kwargs
+        run.source_model, run.target(), run.seed, run.budget, states, run.device, **run.kwargs
     )
     model.learn(run.budget, callback=curve)
 
@@ -141,10 +162,10 @@ def _sysid_retrain(run: Run, curve: LearningCurve) -> None:
         if not isinstance(steps, int) or steps < 1:
             raise ValueError(f"{name} must be an integer of at least 1, got {steps!r}")
     # The target's steps are spent before these are used: what is wrong with them shows now.
-    source = make_vec_env(run.make_source, n_envs=1)
+    source = run.source()
     baselines.unfitted_source(source, declared, identification.get("dynamics_kwargs"))
     baselines.fine_tuned_sac(run.source_model, source, run.seed, run.device, **settings)
-    recorder = baselines.fine_tuned_sac(run.source_model, run.make_target(), run.seed, run.device, gradient_steps=0)
+    recorder = baselines.fine_tuned_sac(run.source_model, run.target(), run.seed, run.device, gradient_steps=0)
     recorder.learn(run.budget, callback=curve)
     assert recorder.replay_buffer is not None  # learn() has filled it
     simulator, _ = baselines.identified_source(

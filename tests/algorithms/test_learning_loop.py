@@ -1,5 +1,7 @@
 """Algorithm 1's bookkeeping: budgets, worlds, checks, logs."""
 
+import csv
+import json
 import warnings
 
 import gymnasium as gym
@@ -162,6 +164,20 @@ def test_logged_keys_are_those_of_the_docs():
     }
     assert expected <= seen
     assert all(len(key) <= 33 and key == key.lower() for key in seen)
+
+
+def test_every_row_of_a_log_tells_its_target_steps(tmp_path):
+    """Readers of progress files, such as SB3's plots, draw all else against them; the source phase takes none."""
+    model = small(RPTO, target=gym.make("Pendulum-v1", g=12.0, max_episode_steps=20), model_train_freq=30)
+    model.set_logger(configure(str(tmp_path), ["json", "csv"]))
+    model.learn(60, source_timesteps=110, log_interval=1)
+    rows = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
+    steps = [row["time/total_timesteps"] for row in rows]
+    phase = [row for row in rows if "pretrain/timesteps" in row]
+    assert len(phase) == 10
+    assert steps == [0] * len(phase) + [20, 40, 60]
+    with open(tmp_path / "progress.csv") as file:
+        assert [float(row["time/total_timesteps"]) for row in csv.DictReader(file)] == steps
 
 
 @pytest.mark.parametrize("cls", OURS)

@@ -1,7 +1,9 @@
 """Step 3: what is stored of branches and of episodes in the source."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import gymnasium as gym
 import mujoco
@@ -10,14 +12,17 @@ import pytest
 import torch as th
 from conftest import SMALL_POLICY, heavier, small
 from gymnasium import spaces
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPO, RPTO
-from sb3_rpto.algorithms.source import BranchSource, SimulatorSource
+from sb3_rpto.algorithms.source import BranchSource, SimulatorSource, try_source
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.simulator import physical_config
+from sb3_rpto.envs import observations
+from sb3_rpto.envs.observations import whole_state
 
 BOUND, WALL = 4.0, 2.0
 LOW, HIGH = np.array([-1.0, -2.0], np.float32), np.array([3.0, 2.0], np.float32)
@@ -257,3 +262,128 @@ def test_a_walker_of_an_episode_of_its_own_stands_as_it_is_then() -> None:
 def test_without_that_all_episodes_have_the_estimate() -> None:
     seen, estimate = masses(simulators(0.0), 100)
     assert seen == [{estimate}] * 2
+
+
+# --- refused at construction -----------------------------------------------------------------------------------------
+
+
+class Imitated(gym.Env):
+    """A pole on a cart with all attributes of gymnasium's class for MuJoCo, but for the method that steps it."""
+
+    def __init__(self) -> None:
+        twin: Any = gym.make(POLE).unwrapped
+        self.model, self.data, self.frame_skip, self.dt = twin.model, twin.data, twin.frame_skip, twin.dt
+        self.observation_space, self.action_space = twin.observation_space, twin.action_space
+
+    def _get_obs(self) -> np.ndarray:
+        return np.concatenate([self.data.qpos, self.data.qvel])
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = self.np_random.uniform(-0.01, 0.01, 2)
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, self.frame_skip)
+        return self._get_obs(), 1.0, bool(abs(self.data.qpos[1]) > 0.2), False, {}
+
+
+class WritesItsMass(InvertedPendulumEnv):
+    """Each reset writes the nominal mass of the pole: nothing is drawn, and phi is undone."""
+
+    def reset_model(self) -> np.ndarray:
+        self.model.body("pole").mass[0] = 4.89462372
+        return super().reset_model()
+
+
+class Drawn(InvertedPendulumEnv):
+    """Single steps do not tell its goal."""
+
+    goal = 0.0
+
+    def reset_model(self) -> np.ndarray:
+        self.goal = float(self.np_random.uniform(-0.5, 0.5))
+        return super().reset_model()
+
+    def step(self, action: np.ndarray) -> Any:
+        observation, _, *rest = super().step(action)
+        return observation, -abs(float(observation[0]) - self.goal), *rest
+
+
+def stuck() -> gym.Env:
+    """It holds what cannot be copied."""
+    env = gym.make(POLE)
+    env.unwrapped.lock = (n for n in ())  # type: ignore[attr-defined]
+    return env
+
+
+def limited(env: gym.Env) -> gym.Env:
+    return gym.wrappers.TimeLimit(env, 50)
+
+
+@pytest.fixture
+def _read_as_states() -> Any:
+    """States are the observations, whoever wrote ``_get_obs``."""
+    told = {cls: lambda env: whole_state(2, 2) for cls in (Imitated, WritesItsMass, Drawn)}
+    with mock.patch.dict(observations._registered, told):
+        yield
+
+
+REFUSED = [
+    (lambda: limited(Imitated()), {}, "Imitated is no gymnasium MuJoCo environment"),
+    (lambda: limited(Imitated()), {"close_loop": True}, "Imitated is no gymnasium MuJoCo environment"),
+    (lambda: limited(Imitated()), {"dynamics": "residual"}, "Imitated is no gymnasium MuJoCo environment"),
+    (lambda: limited(WritesItsMass()), {}, r"reset\(\) of WritesItsMass writes body_mass"),
+    (lambda: limited(WritesItsMass()), {"dynamics": "residual"}, r"reset\(\) of WritesItsMass writes body_mass"),
+    (lambda: limited(Drawn()), {"dynamics": "residual"}, "depends on more than the state before it"),
+    (lambda: limited(Drawn()), {"weighting": "value_aware"}, "depends on more than the state before it"),
+    (stuck, {}, "cannot be copied"),
+    (stuck, {"dynamics": "residual"}, "cannot be copied"),
+]
+
+
+@pytest.mark.usefixtures("_read_as_states")
+@pytest.mark.parametrize(("make", "settings", "said"), REFUSED)
+def test_a_source_in_which_phi_cannot_act_is_refused_at_construction(
+    make: Callable[[], gym.Env], settings: dict[str, Any], said: str
+) -> None:
+    settings = {"dynamics": "physical", "declared": ["pole.mass"], "dynamics_kwargs": {"threads": 1}, **settings}
+    with pytest.raises(ValueError, match=said):
+        RPTO("MlpPolicy", make(), target_env=heavier(), device="cpu", policy_kwargs=SMALL_POLICY, **settings)
+
+
+@pytest.mark.usefixtures("_read_as_states")
+@pytest.mark.parametrize("dynamics", ["physical", "residual"])
+def test_such_a_source_is_refused_when_it_is_set_and_with_a_checkpoint(dynamics: str, tmp_path: Path) -> None:
+    model: Any = small(
+        RPTO, gym.make(POLE), heavier(), dynamics=dynamics, declared=["pole.mass"], dynamics_kwargs={"threads": 1}
+    )
+    for make, said in ((lambda: limited(Imitated()), "is no gymnasium MuJoCo"), (stuck, "cannot be copied")):
+        before = model.env
+        with pytest.raises(ValueError, match=said):
+            model.set_env(make())
+        assert model.env is before
+        model.save(tmp_path / "model.zip")
+        with pytest.raises(ValueError, match=said):
+            RPTO.load(tmp_path / "model.zip", make(), device="cpu")
+
+
+def test_the_trial_of_a_source_leaves_all_as_it_was() -> None:
+    """Neither the source nor any random stream moves, so a run is the one that it was without a trial."""
+    env = DummyVecEnv([lambda: gym.make(POLE)])
+    env.seed(3)
+    env.reset()
+    dynamics = PhysicalDynamics(
+        env.observation_space, env.action_space, **physical_config(env), declared=["pole.mass"], threads=1
+    )
+    before, data = dynamics.generator.get_state(), env.envs[0].unwrapped.data.qpos.copy()  # type: ignore[attr-defined]
+    states = th.get_rng_state(), env.envs[0].unwrapped.np_random.bit_generator.state, dynamics.values.copy()
+    try_source(env, dynamics, single_steps=True)
+    np.testing.assert_array_equal(env.envs[0].unwrapped.data.qpos, data)  # type: ignore[attr-defined]
+    assert th.equal(dynamics.generator.get_state(), before)
+    assert th.equal(th.get_rng_state(), states[0])
+    assert env.envs[0].unwrapped.np_random.bit_generator.state == states[1]
+    np.testing.assert_array_equal(dynamics.values, states[2])

@@ -13,9 +13,11 @@ import pandas as pd
 import pytest
 import torch as th
 from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPTO, cli
 from sb3_rpto.algorithms import closing
+from sb3_rpto.algorithms.normalisation import read_statistics
 from sb3_rpto.commands import enjoy
 from sb3_rpto.commands.progress import Progress
 from sb3_rpto.commands.recordings import digest
@@ -221,3 +223,21 @@ def test_a_simulator_that_could_not_be_written_is_told_before_the_trace(given: P
     assert "error: --out: " in (said := capsys.readouterr().err)
     assert "would be overwritten; save elsewhere" in said
     assert [path.name for path in tmp_path.iterdir()] == ["model.xml"]
+
+
+@pytest.mark.slow
+def test_an_agent_that_saw_normalised_observations_is_adapted_by_its_statistics(given: Path, tmp_path: Path, capsys):
+    agent, env = tmp_path / "agent", VecNormalize(DummyVecEnv([lambda: gym.make(ENV)]))
+    agent.mkdir()
+    env.obs_rms.mean[:], env.obs_rms.var[:], env.obs_rms.count = 0.5, 0.04, 1e6
+    SAC("MlpPolicy", env, policy_kwargs={"net_arch": [16]}, seed=0, device="cpu").learn(20).save(agent / "agent.zip")
+    env.save(str(agent / "vecnormalize.pkl"))
+    shutil.copy(given / "log.csv", agent / "log.csv")
+    out = tmp_path / "out"
+    assert adapt(agent, out) == 0
+    assert f"ZIP sees observations normalised by {agent / 'vecnormalize.pkl'}" in capsys.readouterr().err
+    statistics = read_statistics(out / "vecnormalize.pkl")
+    np.testing.assert_allclose(statistics.obs_rms.mean, 0.5, atol=0.01)
+    assert 1e6 < statistics.obs_rms.count < 1.1e6
+    assert cli.main(["enjoy", str(out), "--episodes", "1"]) == 0
+    assert "MODEL sees observations normalised by" in capsys.readouterr().err

@@ -23,10 +23,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import load_from_pkl
 
 from sb3_rpto import RPO, RPTO, cli
+from sb3_rpto.algorithms.normalisation import statistics_of
 from sb3_rpto.algorithms.slbo import SLBO
 from sb3_rpto.commands import enjoy, options, video
 from sb3_rpto.commands.plot import draw, read_rows
-from sb3_rpto.commands.policies import load_policy, statistics_of
+from sb3_rpto.commands.policies import load_policy
 from sb3_rpto.commands.runs import RunFolder, SavedCurve
 from sb3_rpto.effects.carry import load_corrected
 from sb3_rpto.experiments.curve import evaluate
@@ -608,24 +609,6 @@ def test_a_film_plays_recurrent_policies_with_their_memory() -> None:
     scene = video._Scene(video.Panel("", Remembers(), lambda: Watched(gym.make("Pendulum-v1"))), seed=0)
     scene.advance(3)
     assert acted == [0.1, 0.2, 0.3]
-
-
-@pytest.mark.parametrize("zoo", [False, True])
-def test_normalised_observations_are_told(
-    zoo: bool, agent: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copy(agent / "model.zip", tmp_path / "Some-v0.zip")
-    folder = tmp_path / "Some-v0" if zoo else tmp_path
-    folder.mkdir(exist_ok=True)
-    for name in ("vecnormalize.pkl", "args.yml"):
-        (folder / name).write_text("")
-    given = ["transfer", str(tmp_path / "Some-v0.zip"), TARGET, "--method", "rpo", "--out", str(tmp_path / "out")]
-    assert cli.main(given) == 2
-    assert f"normalised by {folder / 'vecnormalize.pkl'}" in error(capsys)
-    assert cli.main(["adapt", str(tmp_path / "Some-v0.zip"), SOURCE, "log.csv", "--out", str(tmp_path / "out")]) == 2
-    assert f"normalised by {folder / 'vecnormalize.pkl'}" in error(capsys)
-    assert cli.main(["enjoy", str(tmp_path / "Some-v0.zip"), TARGET, "--episodes", "1"]) == 0
-    assert f"normalised by {folder / 'vecnormalize.pkl'}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
