@@ -40,7 +40,13 @@ SMOOTHING = 0.06
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # the first of the scalar ones
 _LIMIT = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)  # the first of limits and contacts
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-_KNOWN_DYNAMICS = (int(mujoco.mjtDyn.mjDYN_NONE), *FILTERS)
+_NO_DYNAMICS, _USER = int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtDyn.mjDYN_USER)
+_STATES = {
+    int(mujoco.mjtDyn.mjDYN_INTEGRATOR): "it integrates its command",
+    int(mujoco.mjtDyn.mjDYN_PID): "the integral of its regulator",
+    int(mujoco.mjtDyn.mjDYN_DCMOTOR): "its current, temperature, friction or the integral of its regulator",
+    _USER: "dyntype user",
+}
 _NO_BIAS, _FIXED = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtGain.mjGAIN_FIXED)
 _MAX_LAG = 25
 _FEWEST = 30
@@ -111,9 +117,9 @@ def _check_actuators(model: mujoco.MjModel) -> None:
         count, dynamics = model.actuator_ctrlnum[i], int(model.actuator_dyntype[i])
         if count != 1:
             raise ValueError(f"actuator {name!r} takes {count} commands; traced are those of one, such as <position>")
-        known = dynamics in _KNOWN_DYNAMICS
-        if not known or model.actuator_actnum[i] > (dynamics in FILTERS):
-            kind = "of a plugin" if known else f"dyntype {mujoco.mjtDyn(dynamics).name.removeprefix('mjDYN_').lower()}"
+        states = int(model.actuator_actnum[i])
+        if states > (dynamics in FILTERS) or dynamics == _USER:
+            kind = _STATES.get(dynamics, "of a plugin")
             raise ValueError(
                 f"actuator {name!r} has a state of its own ({kind}) that no column holds and no commands tell; "
                 "model it without, and give what it puts out as its command"
@@ -258,7 +264,7 @@ def doubts(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
             message = f"it is {commands[0]:g} throughout; is that what the actuator was told?"
             found.append(Finding("constant command", f"{ALL}, ctrl.{name}", message))
     for column, (name, i) in enumerate(zip(data.columns.ctrl, command_order(model, data))):
-        plain = model.actuator_biastype[i] == _NO_BIAS and model.actuator_dyntype[i] == _KNOWN_DYNAMICS[0]
+        plain = model.actuator_biastype[i] == _NO_BIAS and model.actuator_dyntype[i] == _NO_DYNAMICS
         if not (plain and model.actuator_forcelimited[i] and model.actuator_gaintype[i] == _FIXED):
             continue
         forces = model.actuator_gainprm[i, 0] * np.concatenate([e.ctrl[:, column] for e in data.episodes])
