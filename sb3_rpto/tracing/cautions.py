@@ -20,6 +20,7 @@ from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.misread import CLEARLY
 from sb3_rpto.tracing.prepare import SHORTER, SetUp
 from sb3_rpto.tracing.select import Selector
+from sb3_rpto.tracing.unreached import Hint
 from sb3_rpto.tracing.windows import cut, noise_levels
 
 JOINT, SLIDE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -236,7 +237,9 @@ def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> 
         'solreffriction="0.001 1" there, and solimpfriction="0.99 0.99", as that of machines holds; or name '
         "soft_friction among the candidates, or among the known effects"
     )
-    return [Finding("soft friction", ", ".join(e.label for e in firm), message)]
+    model = problem.simulation.model
+    bodies = frozenset(int(model.dof_bodyid[e.dof]) for e in firm)
+    return [Hint("soft friction", ", ".join(e.label for e in firm), message, bodies=bodies, left=share)]
 
 
 def own_steps(

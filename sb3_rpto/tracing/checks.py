@@ -52,6 +52,14 @@ class Finding:
         return f"{self.kind} in {self.where}: {self.message}"
 
 
+def listed(names: Sequence[str], most: int = 6) -> str:
+    """Names in a sentence, the first few where there are many."""
+    shown, more = [*names[:most]], len(names) - most
+    if more > 0:
+        return f"{', '.join(shown)} and {more} more"
+    return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
+
+
 def grouped(findings: Sequence[Finding]) -> list[Finding]:
     """Findings that say the same of several places as one, in their order."""
     places: dict[tuple[str, str], list[str]] = {}

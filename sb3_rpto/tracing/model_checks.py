@@ -12,12 +12,13 @@ from scipy.signal import savgol_filter
 
 from sb3_rpto.effects import Declared, Simulation
 from sb3_rpto.effects.actuation import FILTERS
-from sb3_rpto.effects.names import hinges, near, object_names
+from sb3_rpto.effects.names import hinges, near, object_id, object_names
 from sb3_rpto.effects.simulation import prepare
 from sb3_rpto.effects.world import BatchWorld
 from sb3_rpto.tracing.checks import WINDOW, Finding, smoothed_velocity
 from sb3_rpto.tracing.columns import columns_of, joint_of
 from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.unreached import Hint, mocap_bodies, moved_by_mocap
 from sb3_rpto.tracing.windows import command_order, discretised, stiff
 
 ALL = "all episodes"
@@ -76,7 +77,7 @@ def check_against(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     _check_actuators(model)
     check_clock(model, data)
     _check_settings(model, data)
-    return _sampling(model, data) + _clipped(model, data) + _responses(model, data)
+    return _sampling(model, data) + mocap_bodies(model) + _clipped(model, data) + _responses(model, data)
 
 
 def check_names(model: mujoco.MjModel, data: Measurements) -> None:
@@ -144,6 +145,8 @@ def soft_ties(model: mujoco.MjModel) -> list[Finding]:
     """Equality constraints that give way as MuJoCo's do where nothing else is said; those of a machine hardly do."""
     found = []
     for tie in np.flatnonzero((model.eq_solref[:, 0] > SOFT) & (model.eq_active0 != 0)):
+        if moved_by_mocap(model, int(tie)):  # which nobody knows to be where it is taken to be
+            continue
         message = (
             f"the constraint gives way over some {1e3 * model.eq_solref[tie, 0]:g} ms (its solref); where the "
             f'machine\'s is rigid, set solref="{max(0.002, 2 * model.opt.timestep):g} 1" '
@@ -247,9 +250,10 @@ def _clipped(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     return found
 
 
-def doubts(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
+def doubts(model: mujoco.MjModel, data: Measurements) -> list[Hint]:
     """What may be wrong where nothing explains recordings: angles in degrees, constant commands, limits of motors."""
-    found, joints = [], hinges(model)
+    found: list[Hint] = []
+    joints = hinges(model)
     for i, name in enumerate(data.columns.qpos):
         turns = float(np.median([np.ptp(e.qpos[:, i]) for e in data.episodes])) / (2 * np.pi)
         if name in joints and turns > TURNS:
@@ -257,12 +261,13 @@ def doubts(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
                 f"it spans {turns:.0f} turns in a typical run; if it is in degrees, give rad (also where the MJCF has "
                 'angle="degree")'
             )
-            found.append(Finding("large angle", f"{ALL}, qpos.{name}", message))
+            there = frozenset({int(model.jnt_bodyid[object_id(model, "joint", name)])})
+            found.append(Hint("large angle", f"{ALL}, qpos.{name}", message, bodies=there))
     for i, name in enumerate(data.columns.ctrl):
         commands = np.concatenate([e.ctrl[:, i] for e in data.episodes])
         if np.ptp(commands) == 0:
             message = f"it is {commands[0]:g} throughout; is that what the actuator was told?"
-            found.append(Finding("constant command", f"{ALL}, ctrl.{name}", message))
+            found.append(Hint("constant command", f"{ALL}, ctrl.{name}", message))
     for column, (name, i) in enumerate(zip(data.columns.ctrl, command_order(model, data))):
         plain = model.actuator_biastype[i] == _NO_BIAS and model.actuator_dyntype[i] == _NO_DYNAMICS
         if not (plain and model.actuator_forcelimited[i] and model.actuator_gaintype[i] == _FIXED):
@@ -275,7 +280,7 @@ def doubts(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
                 f"{beyond:.1%} of the samples ask for more than the model's forcerange [{low:g}, {high:g}], where it "
                 "limits the force: is that the machine's range?"
             )
-            found.append(Finding("limited force", f"{ALL}, ctrl.{name}", message))
+            found.append(Hint("limited force", f"{ALL}, ctrl.{name}", message))
     return found
 
 

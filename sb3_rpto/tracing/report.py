@@ -381,7 +381,7 @@ class Report:
             "force_before": forces(self.force_before),
             "force_after": forces(self.force_after),
             "learnable": forces(self.learnable),
-            "findings": [vars(f) for f in self.findings],
+            "findings": [{"kind": f.kind, "where": f.where, "message": f.message} for f in self.findings],
             "zeros": self.zeros and self.zeros.to_json(),
             "noise": self.noise,
             "runs": self.runs,

@@ -6,18 +6,19 @@ import numpy as np
 
 from sb3_rpto.effects import Declared, Scales, Simulation
 from sb3_rpto.effects.library import candidates
-from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.effects.names import object_id
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.misread import CLEARLY, FITTED, ITERATIONS, WINDOWS
 from sb3_rpto.tracing.prepare import SetUp
 from sb3_rpto.tracing.search import Found
+from sb3_rpto.tracing.unreached import Hint
 from sb3_rpto.tracing.windows import cut
 
 #: A body is looked at with these changes of its mass; those that promise most are fitted.
 LOOKS = (-0.3, 0.4)
 
 
-def undeclared_mass(found: Found, set_up: SetUp) -> list[Finding]:
+def undeclared_mass(found: Found, set_up: SetUp) -> list[Hint]:
     """The body with another mass of which the model errs far less, with what was found as far as that is needed then.
 
     Its inertia goes with it. Of a machine's recordings no effect that is looked for does the same: a ``payload`` is a
@@ -52,4 +53,5 @@ def undeclared_mass(found: Found, set_up: SetUp) -> list[Finding]:
         f"with {times:.3g} times its mass the model errs by {share:.0%} of what it does: declare {body}.mass, "
         "and trace again"
     )
-    return [Finding("undeclared mass", body, message)]
+    where = frozenset({object_id(set_up.nominal, "body", body)})
+    return [Hint("undeclared mass", body, message, bodies=where, left=share)]
