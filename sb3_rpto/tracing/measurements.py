@@ -207,8 +207,8 @@ class Measurements:
                 )
                 content += (run.time - run.time[0]).round(9).tobytes()
                 if content in seen:
-                    message = f"the same samples as episode {seen[content]}; only that one is kept"
-                    findings.append(Finding("duplicate", name, message))
+                    message = f"the same samples as episode {seen[content]!r}; only that one is kept"
+                    findings.append(Finding.of_run("duplicate", name, "", message))
                     continue
                 seen[content] = name
                 episodes += repair(run, columns, findings)

@@ -333,7 +333,7 @@ def _signs(where: str, fits: dict[str, tuple[float, float]]) -> list[Finding]:
     if not right:
         return []
     message = "here, unlike in other runs, the motion needs the opposite force (correlation {:.2f}); kept as it is"
-    return [Finding("flipped sign", f"{run}, {where}", message.format(fits[run][0])) for run in flipped]
+    return [Finding.of_run("flipped sign", run, where, message.format(fits[run][0])) for run in flipped]
 
 
 def _correlate(parts: list[_Force]) -> tuple[np.ndarray, np.ndarray] | None:

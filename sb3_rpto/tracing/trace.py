@@ -33,7 +33,7 @@ from sb3_rpto.tracing.cautions import (
     unstable,
     vague_noise,
 )
-from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.checks import Finding, grouped
 from sb3_rpto.tracing.conclude import Searched, conclude
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Fit, Problem
@@ -177,7 +177,7 @@ def trace(
         ),
         residuals_before=residuals_before,
         residuals_after=residuals_after,
-        findings=findings,
+        findings=grouped(findings),
         zeros=zeros,
         noise=dict(zip(data.columns.qpos, sigma.tolist())),
         runs={

@@ -55,7 +55,7 @@ def test_it_prints_in_a_line():
     data = several(2)
     assert repr(data) == str(data) == "<Measurements: 2 episodes, 400 samples, 3.98 s; joints hinge; actuators motor>"
     gaps = [checks.Finding("gap", f"episode {i}", "cut in two") for i in range(3)]
-    assert str(replace(data, findings=gaps)) == f"{data!r}\n  gap in episode 0 and 2 more: cut in two"
+    assert str(replace(data, findings=gaps)) == f"{data!r}\n  gap in episode 0, episode 1 and episode 2: cut in two"
 
 
 def test_clean_data_have_no_findings():
@@ -201,7 +201,63 @@ def test_a_run_with_another_clock_is_refused_by_name(other):
 def test_what_is_found_in_many_places_is_said_once():
     tables = {f"run{i}": {k: v for k, v in swing(phase=i).items() if k != "qvel.hinge"} for i in range(3)}
     (once,) = grouped(Measurements.from_tables(tables).findings)
-    assert (once.kind, once.where) == ("missing velocity", "run0, qvel.hinge and 2 more")
+    assert (once.kind, once.where) == ("missing velocity", "qvel.hinge of run0, run1 and run2")
+    assert once.runs == ("run0", "run1", "run2")
+
+
+def test_what_differs_by_run_in_numbers_alone_is_a_line_with_their_range():
+    tables = {}
+    for run in range(8):
+        rng, table = np.random.default_rng(run), swing(phase=run)
+        table["time"] = table["time"] + (0.002 + 0.0002 * run) * rng.uniform(-1, 1, 200)
+        tables[f"run{run}"] = {k: v for k, v in table.items() if k != "qvel.hinge"}
+    data = Measurements.from_tables(tables)
+    shares = [f.message.split()[3].rstrip("%") for f in data.findings if f.kind == "jitter"]
+    assert len(shares) == 8
+    found = grouped(data.findings)
+    assert [f.kind for f in found] == ["jitter", "missing velocity"]
+    assert found[0].where == "time of run0, run1, run2, run3, run4, run5 and 2 more"
+    least, most = min(shares, key=int), max(shares, key=int)
+    assert found[0].message.startswith(f"steps vary by {least} to {most}% around their median of ")
+    assert found[0].runs == tuple(tables)
+    assert grouped(found) == found
+    assert len(str(data).splitlines()) == 3
+
+
+def test_a_finding_is_said_of_several_places_and_numbers_of_names_are_no_range():
+    of_run, plain = checks.Finding.of_run, checks.Finding
+    found = grouped(
+        [
+            of_run("gap", "a", "", "1 gap(s), the longest 0.5 s"),
+            of_run("glitch", "a", "qpos.x", "3 far"),
+            of_run("glitch", "a", "qpos.y", "3 far"),
+            of_run("gap", "b", "", "12 gap(s), the longest -1.5e-05 s"),
+            of_run("glitch", "b", "qpos.x", "3 far"),
+            of_run("glitch", "b", "qpos.y", "3 far"),
+            of_run("slope", "a", "qvel.x", "it is 2"),
+            of_run("slope", "b", "qvel.y", "it is 3"),
+            of_run("duplicate", "a", "", "the same as episode '1'"),
+            of_run("duplicate", "b", "", "the same as episode '2'"),
+            of_run("other", "a", "", "motor2 moves"),
+            of_run("other", "b", "", "motor3 moves"),
+            plain("soft tie", "equality 0", "gives way over 20 ms"),
+            plain("soft tie", "equality 1", "gives way over 20 ms"),
+            plain("soft tie", "equality 2", "gives way over 30 ms"),
+        ]
+    )
+    assert [str(one) for one in found] == [
+        "gap in a and b: 1 to 12 gap(s), the longest -1.5e-05 to 0.5 s",
+        "glitch in qpos.x and qpos.y of a and b: 3 far",
+        "slope in a, qvel.x: it is 2",
+        "slope in b, qvel.y: it is 3",
+        "duplicate in a: the same as episode '1'",
+        "duplicate in b: the same as episode '2'",
+        "other in a: motor2 moves",
+        "other in b: motor3 moves",
+        "soft tie in equality 0 and equality 1: gives way over 20 ms",
+        "soft tie in equality 2: gives way over 30 ms",
+    ]
+    assert grouped(found) == found
 
 
 def test_gzipped_csv(tmp_path):
@@ -723,7 +779,7 @@ def test_duplicate_is_dropped_and_reported():
     later["time"] = later["time"] + 100.0
     data = Measurements.from_tables({"a": swing(), "b": swing(1.0), "c": later})
     assert [e.name for e in data.episodes] == ["a", "b"]
-    assert [str(f) for f in data.findings] == ["duplicate in c: the same samples as episode a; only that one is kept"]
+    assert [str(f) for f in data.findings] == ["duplicate in c: the same samples as episode 'a'; only that one is kept"]
 
 
 @given(st.integers(1, 15), st.integers(0, 1000))
