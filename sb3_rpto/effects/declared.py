@@ -217,7 +217,8 @@ def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:
     if isinstance(names, Mapping) or not all(isinstance(entry, str) for entry in entries):
         raise TypeError(f"declared must be a list of names, not {names!r}; bounds are part of one: 'arm.mass=0.2:0.9'")
     found: dict[tuple[str, int, str], Declared] = {}
-    known = parameter_names(model)
+    # What has none of these marks is a name as it stands.
+    known = parameter_names(model) if any(c in entry for entry in entries for c in "=*?[") else []
     for entry in entries:
         name, bounds = _parted(entry, known)
         matches = [name]

@@ -8,8 +8,6 @@ import numpy as np
 from sb3_rpto.tracing.checks import WINDOW, smoothed_velocity
 
 _LIMIT = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)  # the first of limits and contacts
-
-
 #: Time that the filter of noisy recordings spans, in s.
 SMOOTHING = 0.06
 

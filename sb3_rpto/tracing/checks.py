@@ -37,6 +37,7 @@ WINDOW = 9
 """Samples of the filter that differentiates positions."""
 
 
+#: A number in a message, not one that is part of a name.
 _NUMBER = re.compile(r"(?<![\w.,'\"+-])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])(?!\.\d)")
 
 

@@ -20,7 +20,7 @@ from sb3_rpto.tracing.checks import Finding, smoothed_velocity
 from sb3_rpto.tracing.columns import columns_of, joint_of
 from sb3_rpto.tracing.degrees import check_degrees, large_angles
 from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.unreached import Hint, mocap_bodies, moved_by_mocap
+from sb3_rpto.tracing.unreached import Hint, mocap_bodies, moved_by_mocap, of_actuator
 from sb3_rpto.tracing.windows import command_order, discretised, stiff
 
 ALL = "all episodes"
@@ -258,11 +258,11 @@ def doubts(model: mujoco.MjModel, data: Measurements) -> list[Hint]:
         )
         there = frozenset({int(model.jnt_bodyid[object_id(model, "joint", name)])})
         found.append(Hint("large angle", f"{ALL}, qpos.{name}", message, bodies=there))
-    for i, name in enumerate(data.columns.ctrl):
-        commands = np.concatenate([e.ctrl[:, i] for e in data.episodes])
+    for column, (name, i) in enumerate(zip(data.columns.ctrl, command_order(model, data))):
+        commands = np.concatenate([e.ctrl[:, column] for e in data.episodes])
         if np.ptp(commands) == 0:
             message = f"it is {commands[0]:g} throughout; is that what the actuator was told?"
-            found.append(Hint("constant command", f"{ALL}, ctrl.{name}", message))
+            found.append(Hint("constant command", f"{ALL}, ctrl.{name}", message, bodies=of_actuator(model, i)))
     for column, (name, i) in enumerate(zip(data.columns.ctrl, command_order(model, data))):
         plain = model.actuator_biastype[i] == _NO_BIAS and model.actuator_dyntype[i] == _NO_DYNAMICS
         if not (plain and model.actuator_forcelimited[i] and model.actuator_gaintype[i] == _FIXED):
@@ -275,7 +275,7 @@ def doubts(model: mujoco.MjModel, data: Measurements) -> list[Hint]:
                 f"{beyond:.1%} of the samples ask for more than the model's forcerange [{low:g}, {high:g}], where it "
                 "limits the force: is that the machine's range?"
             )
-            found.append(Hint("limited force", f"{ALL}, ctrl.{name}", message))
+            found.append(Hint("limited force", f"{ALL}, ctrl.{name}", message, bodies=of_actuator(model, i)))
     return found
 
 

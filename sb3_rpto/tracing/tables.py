@@ -23,23 +23,57 @@ _COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?|[+-]?\d+,([eE][+-]?\d+)?")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|nan|[+-]?inf", re.IGNORECASE)
 _POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eE][+-]?\d+)?")
-#: Units as they are written, of times, of positions and velocities; what is to be given in their place.
+#: Units of the format as they are written, in lower case, and which columns have them.
 _SI = {
-    "s": "time",
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "time"),
     **dict.fromkeys(("rad", "m", "metre", "metres", "meter", "meters", "radian", "radians"), "qpos"),
     **dict.fromkeys(("rad/s", "m/s", "rad*s^-1", "m*s^-1"), "qvel"),
     **dict.fromkeys(("n", "nm", "n*m"), "qfrc"),
-    **dict.fromkeys(("sec", "secs", "second", "seconds"), "time"),
 }
 _NO_UNIT = ("", "-", "1", "none", "n/a")
-_OTHERS = {
-    **dict.fromkeys(("ms", "msec", "us", "ns", "min", "h", "milliseconds", "microseconds", "nanoseconds"), "s"),
-    **dict.fromkeys(("deg", "°", "degree", "degrees", "rev", "revs", "turns", "counts", "ticks", "mrad"), "rad"),
-    **dict.fromkeys(("deg/s", "°/s", "degrees/s", "rpm", "rev/s", "mrad/s"), "rad/s"),
-    **dict.fromkeys(("mm", "cm", "um", "in", "inch"), "m"),
-    **dict.fromkeys(("mm/s", "cm/s"), "m/s"),
-    **dict.fromkeys(("nmm", "n*mm", "ncm", "n*cm", "mnm", "mn*m", "kgcm"), "N·m"),
-}
+#: Those of other tables.
+_OTHERS = frozenset(
+    [
+        "ms",
+        "msec",
+        "us",
+        "ns",
+        "min",
+        "h",
+        "milliseconds",
+        "microseconds",
+        "nanoseconds",
+        "deg",
+        "°",
+        "degree",
+        "degrees",
+        "rev",
+        "revs",
+        "turns",
+        "counts",
+        "ticks",
+        "mrad",
+        "deg/s",
+        "°/s",
+        "degrees/s",
+        "rpm",
+        "rev/s",
+        "mrad/s",
+        "mm",
+        "cm",
+        "um",
+        "in",
+        "inch",
+        "mm/s",
+        "cm/s",
+        "nmm",
+        "n*mm",
+        "ncm",
+        "n*cm",
+        "mnm",
+        "mn*m",
+    ]
+)
 
 
 def read_text(path: str, rename: Mapping[str, str] | None = None) -> dict[str, np.ndarray]:

@@ -151,7 +151,7 @@ def _mocaps(model: mujoco.MjModel) -> list[Thing]:
         for t in range(model.ntendon):
             others |= _of_tendon(model, t) if _of_tendon(model, t) & thing.bodies else set()
         for a in range(model.nactuator):
-            others |= _of_actuator(model, a) if _of_actuator(model, a) & thing.bodies else set()
+            others |= of_actuator(model, a) if of_actuator(model, a) & thing.bodies else set()
         others |= {other for _, other in _touching(model, thing.bodies)}
         if any(model.body_treeid[b] >= 0 for b in others):
             held.append(Thing(thing.kind, thing.name, frozenset(others)))
@@ -236,7 +236,7 @@ def _actuators(model: mujoco.MjModel) -> list[Thing]:
             continue
         else:
             kind = _ENDS.get(end, "actuator")
-        found.append(Thing(kind, repr(name), _of_actuator(model, a)))
+        found.append(Thing(kind, repr(name), of_actuator(model, a)))
     return found
 
 
@@ -274,7 +274,8 @@ def _of_tendon(model: mujoco.MjModel, tendon: int) -> frozenset[int]:
     return frozenset(int(owner[kind][i]) for kind, i in pairs if kind in owner)
 
 
-def _of_actuator(model: mujoco.MjModel, actuator: int) -> frozenset[int]:
+def of_actuator(model: mujoco.MjModel, actuator: int) -> frozenset[int]:
+    """The bodies that an actuator acts at."""
     kind, (one, other) = int(model.actuator_trntype[actuator]), model.actuator_trnid[actuator].tolist()
     if kind == _TENDON:
         return _of_tendon(model, one)
