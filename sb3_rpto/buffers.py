@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import pathlib
 import pickle
+import sys
 import zipfile
 from functools import partial
 from typing import Any, Literal
@@ -73,8 +74,8 @@ class DualReplayBuffer(ReplayBuffer):
             raise ValueError(f"target_size must be a positive integer, got {target_size!r}")
         kwargs = {"handle_timeout_termination": handle_timeout_termination, **(side_kwargs or {})}
         self._make_side = partial(side_class, observation_space=observation_space, action_space=action_space, **kwargs)
-        self.source = self._make_side(buffer_size=buffer_size, device=device)
-        self.target = self._make_side(buffer_size=target_size, device=device)
+        self.source = self._sized("source", buffer_size, device)
+        self.target = self._sized("target", target_size, device)
         #: transitions of this target that were ever added, those that its side forgot included
         self.target_added = 0
         #: whether the target side is a robot's log that was traced, whose states are estimates
@@ -147,6 +148,26 @@ class DualReplayBuffer(ReplayBuffer):
         timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
         self.append("target", obs, next_obs, action, reward, done, timeouts, infos)
 
+    def _sized(self, world: World, capacity: int, device: th.device | str) -> ReplayBuffer:
+        """One side, empty.
+
+        :raises ValueError: it is larger than the memory
+        """
+        seen, done = (self._make_side.keywords[name] for name in ("observation_space", "action_space"))
+        row = int(2 * np.prod(seen.shape) * seen.dtype.itemsize + np.prod(done.shape) * done.dtype.itemsize) + 12
+        try:
+            if capacity * row > sys.maxsize:
+                raise MemoryError
+            return self._make_side(buffer_size=capacity, device=device)
+        except MemoryError as error:
+            name = 'replay_buffer_kwargs["target_size"]'
+            if world == "source":
+                name = "buffer_size (in the source phase source_timesteps, where that is larger)"
+            raise ValueError(
+                f"{name}: {capacity:,} transitions of {row} bytes each, {capacity * row / 2**30:,.0f} GiB, do not fit "
+                "into memory; give a smaller number"
+            ) from error
+
     def resize(self, world: World, capacity: int) -> None:
         """Give one side another capacity; the newest transitions that fit are kept.
 
@@ -161,7 +182,7 @@ class DualReplayBuffer(ReplayBuffer):
             return
         order = rows_in_order(side)[-capacity:]
         kept = {name: getattr(side, name)[order, 0] for name in _ARRAYS if hasattr(side, name)}
-        setattr(self, world, self._make_side(buffer_size=capacity, device=self.device))
+        setattr(self, world, self._sized(world, capacity, self.device))
         if len(order) > 0:
             self.append(world, **kept)
         self.target_added, self.buffer_size = added, self.target.buffer_size

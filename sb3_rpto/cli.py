@@ -12,8 +12,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sb3_rpto.commands import adapt, enjoy, plot, recordings, train, transfer
+from sb3_rpto.commands import adapt, enjoy, options, plot, recordings, train, transfer
 from sb3_rpto.commands.terminal import lines, say
+from sb3_rpto.ranges import THREADS, check
 from sb3_rpto.version import __version__
 
 #: Exit codes: bad input, and interrupted by the user.
@@ -128,7 +129,7 @@ def _add_trace(commands: Commands) -> None:
         help="set the threshold from N data sets simulated from the fitted model (slow; default: as shipped)",
     )
     parser.add_argument(
-        "--threads", metavar="N", type=int, default=0, help="that simulate (default: one for each core)"
+        "--threads", metavar="N", type=int, default=0, help="that simulate (default: 0, one for each core)"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress; print the verdict alone")
     parser.set_defaults(run=_trace)
@@ -144,8 +145,8 @@ def _trace(parsed: argparse.Namespace) -> int:
     recordings.check_candidates(parsed.candidates)
     if parsed.calibrate < 0:
         raise ValueError(f"--calibrate is {parsed.calibrate}; give a number of data sets, or 0 for none")
-    if parsed.threads < 0:
-        raise ValueError(f"--threads is {parsed.threads}; give a number from 1, or 0 for one for each core")
+    options.check_seed(parsed.seed)
+    check({"--threads": THREADS}, {"--threads": parsed.threads})
     if parsed.out.exists() and not parsed.out.is_dir():
         raise ValueError(f"--out {parsed.out} is a file; give a folder")
     model = _model(parsed.model)
@@ -198,8 +199,6 @@ def _model(name: str) -> Any:
     if Path(name).suffix in (".xml", ".mjcf", ".urdf"):
         raise FileNotFoundError(f"there is no MJCF file {name!r}; check the path")
     import gymnasium as gym
-
-    from sb3_rpto.commands import options
 
     with contextlib.suppress(ValueError):  # a task's name, or a shift that is not registered
         return options.world(name, "MODEL").make()

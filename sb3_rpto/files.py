@@ -8,14 +8,19 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-#: A temporary file that is older than so many seconds is nobody's any more.
+try:
+    import fcntl
+except ImportError:  # Windows has none
+    fcntl = None  # type: ignore[assignment]
+
+#: A temporary file that is older than so many seconds is nobody's any more, where locks do not tell.
 LEFT = 3600.0
 
 
@@ -24,20 +29,40 @@ def write_atomically(path: Any, write: Callable[[Any], None], suffix: str = "zip
 
     :param path: where the file goes; ``suffix`` is added when it has none; file objects are written directly
     :param write: writes to the path that it is given
+    :raises ValueError: for a folder
     """
     if not isinstance(path, str | Path):
         write(path)
         return
     path = Path(path)
+    _refuse_folder(path, suffix)
     if path.suffix == "":
         path = path.with_name(f"{path.name}.{suffix}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    _replace(path, write, suffix)
+    with _temporary(path, suffix) as file:
+        write(file)
+        _settle(file)
+        os.replace(file, path)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """The same of contents that are known."""
-    _replace(path, lambda file: file.write_bytes(content), "part")
+    write_together({path: content})
+
+
+def write_together(contents: Mapping[Path, bytes]) -> None:
+    """Write several files, all of them or none: each is replaced once all are on the disk.
+
+    :param contents: by path; folders are there
+    :raises ValueError: one of the paths is a folder
+    """
+    with contextlib.ExitStack() as opened:
+        made = {path: opened.enter_context(_temporary(path, "part")) for path in contents}
+        for path, file in made.items():
+            file.write_bytes(contents[path])
+            _settle(file)
+        for path, file in made.items():
+            os.replace(file, path)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -75,16 +100,71 @@ def plain(value: Any) -> Any:
     return f"{named.__module__}.{named.__qualname__}"
 
 
-def _replace(path: Path, write: Callable[[Path], Any], suffix: str) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{suffix}")
-    for left in path.parent.glob(f".{glob.escape(path.name)}.*.{suffix}"):  # of killed runs, which may fill the disk
+def _refuse_folder(path: Path, suffix: str) -> None:
+    if path.is_dir():
+        raise ValueError(
+            f"{str(path)!r} is a folder; give the name of a file, such as {str(path / f'model.{suffix}')!r}"
+        )
+
+
+def _settle(file: Path) -> None:
+    """Bring the contents to the disk: else the name may outlast a crash of the machine, and they not."""
+    with file.open("rb+") as opened:
+        os.fsync(opened.fileno())
+
+
+@contextlib.contextmanager
+def _temporary(path: Path, suffix: str) -> Iterator[Path]:
+    """An empty file beside ``path`` to write to, gone afterwards; those that killed runs left there go first.
+
+    A lock tells them from those of runs under way: with its process a file's lock goes, too.
+    """
+    _refuse_folder(path, suffix)
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.{suffix}"):
         with contextlib.suppress(OSError):
-            if time.time() - left.stat().st_mtime > LEFT:
+            if _is_left(left):
                 left.unlink()
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{suffix}")
+    with _held(temporary):
+        try:
+            yield temporary
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _held(file: Path) -> Iterator[None]:
+    """The file, made if it is not there, with a lock on it."""
+    if fcntl is None:
+        yield  # an open file could not be replaced there
+        return
+    while True:
+        with file.open("ab") as opened:
+            with contextlib.suppress(OSError):  # of a file system without locks
+                fcntl.flock(opened, fcntl.LOCK_EX)
+            # Another thread may have put it in place meanwhile, or another run have swept it before it was locked.
+            if not _is_at(opened.fileno(), file):
+                continue
+            yield
+            return
+
+
+def _is_at(opened: int, file: Path) -> bool:
     try:
-        write(temporary)
-        with temporary.open("rb+") as file:  # else the name may outlast a crash of the machine, and the contents not
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        return os.path.samestat(os.fstat(opened), file.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _is_left(file: Path) -> bool:
+    """Whether nobody writes to a temporary file any more."""
+    if fcntl is not None:
+        with file.open("rb") as opened:
+            try:
+                fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return True
+            except BlockingIOError:
+                return False
+            except OSError:
+                pass
+    return time.time() - file.stat().st_mtime > LEFT

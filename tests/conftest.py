@@ -9,6 +9,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 
 import gymnasium as gym
 import pytest
+import rounding
 import torch as th
 from filelock import FileLock
 from hypothesis import settings
@@ -32,6 +33,15 @@ OURS = [RPO, pytest.param(RTO, marks=pytest.mark.slow), RPTO]
 PHI_0_STEPS = 100
 SMALL_POLICY = {"net_arch": [16]}
 SMALL_ENSEMBLE = {"hidden": (16, 16), "n_members": 3, "n_elites": 2, "max_steps": 30}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--rounding", action="store_true", help="let products and decompositions err in their last digits")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("rounding"):
+        rounding.install()
 
 
 @pytest.fixture(autouse=True)

@@ -156,7 +156,9 @@ def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixtu
         ({"options": ["--candidates", ""]}, "--candidates is empty"),
         ({"options": ["--horizon", "-1"]}, "--horizon"),
         ({"options": ["--calibrate", "-1"]}, "--calibrate"),
-        ({"options": ["--threads", "-1"]}, "--threads"),
+        ({"options": ["--threads", "-1"]}, "--threads must be a number of threads from 1"),
+        ({"options": ["--threads", "1000000"]}, "or 0 for one for each core, got 1000000"),
+        ({"options": ["--seed", "-1"]}, "--seed is -1"),
         ({"options": ["--seed", "one"]}, "sb3-rpto trace --help"),
     ],
 )
@@ -262,7 +264,7 @@ def test_without_matplotlib_nothing_is_started(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert run(files) == 2
-    assert "sb3-rpto[tracing]" in error(capsys)
+    assert "pip install -e '.[tracing]'" in error(capsys)
 
 
 def test_interrupt_gives_130(files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

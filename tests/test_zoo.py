@@ -7,6 +7,7 @@ import importlib
 import json
 import shutil
 import sys
+from collections import OrderedDict
 from pathlib import Path
 
 import gymnasium as gym
@@ -20,13 +21,20 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_rpto import RPO, RPTO
-from sb3_rpto.algorithms.worlds import NotFiniteError
+from sb3_rpto.algorithms.answers import NotFiniteError
 from sb3_rpto.envs import tasks
 from sb3_rpto.experiments.methods import REGISTRY
 from sb3_rpto.presets import preset_names, resolve_preset
 from sb3_rpto.zoo import enjoy, train
 from sb3_rpto.zoo.samplers import SAMPLERS, convert
-from sb3_rpto.zoo.settings import ALGORITHMS, shipped_algorithms, shipped_file, shipped_settings, source_of
+from sb3_rpto.zoo.settings import (
+    ALGORITHMS,
+    settings_beside,
+    shipped_algorithms,
+    shipped_file,
+    shipped_settings,
+    source_of,
+)
 
 SOURCE, TARGET = "rpto/ContinuousCartPole-v0", "rpto/ContinuousCartPole-limb-x2-v0"
 SMALL = ["-params", "gradient_steps:1", "source_steps:2"]
@@ -82,6 +90,25 @@ def test_the_source_of_a_target():
     assert source_of("rpto/Hopper-gravity-x2-v0") == source_of("rpto/Hopper-v0") == "rpto/Hopper-v0"
     assert source_of("Hopper-v5") is None
     assert source_of("Nothing-v7") is None
+
+
+def test_settings_beside_a_zip_are_read_as_plain_data(tmp_path):
+    folder = tmp_path / "run" / "agent"
+    folder.mkdir(parents=True)
+    told = OrderedDict(n_envs=2, train_freq=(1, "step"), env_kwargs={"g": [9.0]}, normalize=True)
+    ran = tmp_path / "ran"
+    evil = f"!!python/object/apply:os.mkdir ['{ran}']"
+    text = yaml.dump(OrderedDict(told, activation=np.float64)).rstrip() + f"\n  - - evil\n    - {evil}\n"
+    (folder / "config.yml").write_text(text)
+    with pytest.raises(yaml.YAMLError):  # as any reader of plain data says
+        yaml.safe_load(text)
+    assert settings_beside(str(tmp_path / "run" / "agent.zip"), "config.yml") == told
+    assert not ran.exists()
+    for wrong in ("[1, 2]", "a: [", f"{evil}"):
+        (folder / "config.yml").write_text(wrong)
+        with pytest.raises(ValueError, match=r"(?s)config\.yml .*mend it"):
+            settings_beside(str(tmp_path / "run" / "agent.zip"), "config.yml")
+    assert not ran.exists()
 
 
 def test_an_algorithm_without_settings_names_the_others():
@@ -215,8 +242,6 @@ def test_another_seed_begins_new_streams(trained):
 
 
 def test_worlds_are_as_they_were_where_a_run_goes_on(zoo, tmp_path, capsys):
-    from sb3_rpto.zoo.settings import settings_beside
-
     begun = launch(tmp_path, "rpo", "-n", "4", "--source-timesteps", "120", "--eval-freq", "-1", *COLD, "n_envs:2")
     capsys.readouterr()
     resumed = launch(tmp_path, "rpo", "-n", "8", "--eval-freq", "-1", "-i", str(final(begun)))
@@ -498,4 +523,4 @@ def test_wrong_arguments_end_before_the_work(zoo, options, message, capsys):
 def test_without_the_extra_the_remedy_is_named(command, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)
     assert command.main(["--algo", "rpto"]) == 2
-    assert "pip install 'sb3-rpto[zoo]'" in capsys.readouterr().err
+    assert "pip install -e '.[zoo]'" in capsys.readouterr().err

@@ -7,18 +7,18 @@ import math
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from numbers import Integral, Real
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_rpto.algorithms import settings
 from sb3_rpto.algorithms.bookkeeping import TwoWorlds
-from sb3_rpto.dynamics.factory import BACKENDS
-from sb3_rpto.dynamics.weights import WEIGHTINGS
 from sb3_rpto.effects import Declared, Effect
 from sb3_rpto.effects.names import near
+from sb3_rpto.ranges import check
 
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.closing import LoopCloser
@@ -37,11 +37,6 @@ DYNAMICS_ARGUMENTS = frozenset(
         "rollout_start",
         "model_train_freq",
     }
-)
-#: What :func:`check_values` looks at beside the name of the dynamics.
-CHECKED = (
-    *("weighting", "rollout_start", "real_ratio", "weight_floor", "tau", "gamma", "source_steps", "model_train_freq"),
-    *("gradient_steps", "target_update_interval", "batch_size", "buffer_size", "train_freq", "retrain_steps"),
 )
 #: What stands for target steps in an offline run has no use for these.
 ONLINE = frozenset({"action_noise", "train_freq"})
@@ -166,18 +161,6 @@ def check_names(cls: type, passed: Collection[str]) -> None:
             raise TypeError(f"{cls.__name__} has no argument {name!r}; {near(name, sorted(known - {'self'}))}")
 
 
-def check_learning_rate(learning_rate: Any) -> None:
-    """Refuse what stands in the learning rate's place by mistake.
-
-    :raises TypeError: it is neither a number nor a schedule
-    """
-    if not (_is_number(learning_rate) or callable(learning_rate)):
-        raise TypeError(
-            f"learning_rate must be a number or a schedule, not {type(learning_rate).__name__}; an environment of the "
-            "target is passed by name, target_env="
-        )
-
-
 def check_applicable(algorithm: str, updates_dynamics: bool, passed: Collection[str]) -> None:
     """Refuse arguments that the algorithm has no use for.
 
@@ -192,8 +175,12 @@ def check_applicable(algorithm: str, updates_dynamics: bool, passed: Collection[
 
 
 def check_values_of(model: TwoWorlds) -> None:
-    """:func:`check_values` of what a model was given."""
-    check_values(dynamics=model.dynamics_backend, **{name: getattr(model, name) for name in CHECKED})
+    """Refuse values out of range in a model that is made: a preset, a subclass or a checkpoint may have set them.
+
+    :raises ValueError: naming the argument and what it must be
+    """
+    rules = {**settings.OF_SAC, **settings.OURS}
+    check(rules, {**vars(model), "dynamics": model.dynamics_backend, "policy": model.policy_class})
 
 
 @contextmanager
@@ -223,94 +210,12 @@ def begin_temperature(model: SAC, ent_coef: Any) -> None:
         model.log_ent_coef.data.fill_(math.log(float(begin)))
 
 
-def check_values(
-    *,
-    dynamics: str,
-    weighting: str | None,
-    rollout_start: str,
-    real_ratio: float,
-    weight_floor: float,
-    tau: float,
-    gamma: float,
-    source_steps: Any,
-    model_train_freq: Any,
-    gradient_steps: Any,
-    target_update_interval: Any,
-    batch_size: Any,
-    buffer_size: Any,
-    train_freq: Any,
-    retrain_steps: Any,
-) -> None:
-    """Refuse names that do not exist and numbers out of range; arguments as those of the algorithms.
-
-    :raises ValueError: naming the argument, its value and what it may be
-    """
-    for name, value, choices in (
-        ("dynamics", dynamics, BACKENDS),
-        ("weighting", weighting, (*WEIGHTINGS, None)),
-        ("rollout_start", rollout_start, ("target", "source", "mix")),
-    ):
-        if value not in choices:
-            raise ValueError(f"{name}={value!r} does not exist; choose one of {list(choices)}")
-    if not 0 <= real_ratio < 1:
-        raise ValueError(f"real_ratio must lie in [0, 1), got {real_ratio}")
-    if not 0 <= weight_floor < math.inf:
-        raise ValueError(f"weight_floor must be a finite number and not negative, got {weight_floor}")
-    check_sac_values(
-        tau=tau,
-        gamma=gamma,
-        gradient_steps=gradient_steps,
-        target_update_interval=target_update_interval,
-        batch_size=batch_size,
-        buffer_size=buffer_size,
-        train_freq=train_freq,
-    )
-    _check_counts(source_steps=source_steps, model_train_freq=model_train_freq)
-    if not _is_integer(retrain_steps) or retrain_steps < 0:
-        raise ValueError(f"retrain_steps must be an integer and not negative, got {retrain_steps!r}")
-
-
-def check_sac_values(
-    *,
-    tau: Any,
-    gamma: Any,
-    gradient_steps: Any,
-    target_update_interval: Any,
-    batch_size: Any,
-    buffer_size: Any,
-    train_freq: Any,
-) -> None:
-    """Refuse numbers out of range of the arguments that SAC has.
-
-    :raises ValueError: naming the argument, its value and what it may be
-    """
-    if not (_is_number(tau) and 0 < tau <= 1):
-        raise ValueError(f"tau must lie in (0, 1], got {tau!r}")
-    if not (_is_number(gamma) and 0 <= gamma <= 1):
-        raise ValueError(f"gamma must lie in [0, 1], got {gamma!r}")
-    if not _is_integer(gradient_steps):
-        raise ValueError(f"gradient_steps must be an integer (negative: one a target step), got {gradient_steps!r}")
-    _check_counts(
-        target_update_interval=target_update_interval,
-        batch_size=batch_size,
-        buffer_size=buffer_size,
-        train_freq=train_freq[0] if isinstance(train_freq, tuple) else train_freq,  # or (number, unit)
-    )
-
-
-def _check_counts(**values: Any) -> None:
-    for name, value in values.items():
-        if not _is_integer(value) or value < 1:
-            raise ValueError(f"{name} must be a positive integer, got {value!r}")
-
-
-def check_ready(
-    model: TwoWorlds, total_timesteps: int, source_timesteps: int | None, log_interval: int | None = None
-) -> None:
+def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | None, **others: Any) -> None:
     """Refuse to learn without both worlds or with a budget that makes no sense; arguments as those of ``learn()``.
 
     :raises ValueError: naming what is missing or wrong
     """
+    check(settings.OF_LEARN, {"total_timesteps": total_timesteps, "source_timesteps": source_timesteps, **others})
     if model.env is None:
         raise ValueError("learn() needs the source environment: pass env= to load(), or call set_env()")
     if model.env.env_is_wrapped(Monitor)[0] and not model.env.get_attr("allow_early_resets", indices=[0])[0]:
@@ -320,17 +225,11 @@ def check_ready(
             "learn() needs the target: pass target_env= (an environment to interact with) or target_data= "
             "(recorded transitions, RTO and RPTO) to the constructor, or call set_target_env()"
         )
-    if not _is_integer(total_timesteps) or total_timesteps <= 0:
-        raise ValueError(f"total_timesteps must be a positive integer, got {total_timesteps!r}")
     if model.target_env is not None and total_timesteps < model.target_env.num_envs:
         raise ValueError(
             f"total_timesteps={total_timesteps} is less than one step of target_env's {model.target_env.num_envs} "
             "environments; raise it or use fewer"
         )
-    if source_timesteps is not None and (not _is_integer(source_timesteps) or source_timesteps < 0):
-        raise ValueError(f"source_timesteps must be an integer and not negative, got {source_timesteps!r}")
-    if log_interval == 0:
-        raise ValueError("log_interval is 0; give the target episodes between two logs, or None to log nothing")
     if model._offline and not model._traces_log and model.replay_buffer.target.size() == 0:
         raise ValueError("D_target is empty: a checkpoint does not hold the target_data; call load_replay_buffer()")
     _warn_of_little(model, total_timesteps)
@@ -389,11 +288,3 @@ def _first_trace(model: TwoWorlds, loop: LoopCloser) -> int:
     """After how many target steps the first trace is made: with enough of them, at a fit; 0 where it was."""
     wait, done = loop.first_comes_after(model), model._since_fit
     return max(wait, 0) and -(-(wait + done) // model.model_train_freq) * model.model_train_freq - done
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool)

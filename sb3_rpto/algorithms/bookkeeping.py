@@ -17,8 +17,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFr
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
+from sb3_rpto.algorithms.answers import Answers, check_finite
 from sb3_rpto.algorithms.listeners import count_in_target
-from sb3_rpto.algorithms.machine import check_machine, check_simulator, doubt, doubt_rules
+from sb3_rpto.algorithms.machine import check_machine, check_simulator, doubt, doubt_rules, doubt_what_is_left
 from sb3_rpto.algorithms.normalisation import check_normalisation, normalises, rescaled
 from sb3_rpto.algorithms.snapshots import PolicySnapshots
 from sb3_rpto.algorithms.source import SourceWorld
@@ -26,7 +27,6 @@ from sb3_rpto.algorithms.worlds import (
     NullShiftCheck,
     TargetLedger,
     check_environment,
-    check_finite,
     check_pair,
     find_ledger,
     last_observations,
@@ -105,6 +105,8 @@ class TwoWorlds(PolicySnapshots):
     _judged_target: bool = False
     #: whether a rule of the source was seen not to be this target's
     _judged_rules: bool = False
+    #: whether what its fit leaves of exact data was judged
+    _judged_rest: bool = False
     #: the run's callbacks while it lasts: they know the step that SB3 has taken and not yet stored
     _callback: BaseCallback | None
     #: where a loaded checkpoint left the worlds, until ``learn()`` puts them back
@@ -149,7 +151,7 @@ class TwoWorlds(PolicySnapshots):
         self._bind_rules(venv, of_target=True)
         self._has_target_rules = False  # but of the last one
         self.target_env = share_normalisation(TargetLedger(venv, self.target_spent), self.env)
-        self._offline = self._traces_log = self._judged_target = self._judged_rules = False
+        self._offline = self._traces_log = self._judged_target = self._judged_rules = self._judged_rest = False
         self._last_obs = self._null_check = None
         seed = self.seed if self._new_seed is None else self._new_seed
         if seed is not None:
@@ -177,6 +179,8 @@ class TwoWorlds(PolicySnapshots):
         """Warn, after the first fit (with the loop closed: after the first trace), where the simulator does not fit."""
         assert self.dynamics is not None
         self._judged_rules = self._judged_rules or doubt_rules(self.dynamics, data)
+        if self.loop is None and not self._judged_rest:
+            self._judged_rest = doubt_what_is_left(self.dynamics, error, data)
         if self._judged_target or (self.loop is not None and not self.loop.traced):
             return
         self._judged_target = True
@@ -265,9 +269,10 @@ class TwoWorlds(PolicySnapshots):
         disturbed = self.target_env is not None and find_ledger(self.target_env).lost(warn=not starts_episode)
         noise, self.action_noise = self.action_noise, None  # SB3 would size it by the source
         try:
-            total_timesteps, callback = super()._setup_learn(
-                total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-            )
+            with Answers("source").received():  # SB3 resets it
+                total_timesteps, callback = super()._setup_learn(
+                    total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+                )
         finally:
             self.action_noise = noise
         _make_room_for_names(self.logger)
@@ -355,7 +360,8 @@ class TwoWorlds(PolicySnapshots):
         raw: Any = new_obs, reward
         if normaliser is not None:  # which clips what is infinite, and what is stored comes from below it
             raw = normaliser.get_original_obs(), normaliser.get_original_reward()
-        find_ledger(self.target_env).check(*map(np.asarray, raw), *ended.values())
+        normalised = normaliser is not None and normaliser.norm_reward
+        find_ledger(self.target_env).check(*map(np.asarray, raw), *ended.values(), normalised=normalised)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         if normaliser is not None:  # what SB3 stores is clipped then
             side = self.replay_buffer.target

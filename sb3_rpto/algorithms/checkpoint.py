@@ -6,32 +6,32 @@ import inspect
 import io
 import pathlib
 import pickle
-import random
-import warnings
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
 import cloudpickle
 import gymnasium as gym
-import numpy as np
 import torch as th
 from stable_baselines3 import SAC
+from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_rpto.algorithms import zips
 from sb3_rpto.algorithms.arguments import (
     begin_temperature,
     check_values_of,
     constructor_names,
     one_kind_of_temperature,
 )
-from sb3_rpto.algorithms.bookkeeping import STEP, TARGET_SEED_OFFSET, RuleOfEnvironment, TwoWorlds
+from sb3_rpto.algorithms.bookkeeping import RuleOfEnvironment, TwoWorlds
 from sb3_rpto.algorithms.machine import check_simulator
 from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
-from sb3_rpto.algorithms.worlds import find_ledger
+from sb3_rpto.algorithms.plain_sac import sac_of_model
+from sb3_rpto.algorithms.resuming import capture
+from sb3_rpto.algorithms.settings import check_given
+from sb3_rpto.algorithms.worlds import check_environment
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.effects.names import near
-from sb3_rpto.envs.state import reseed, restore_state, restore_statistics, save_state, save_statistics
 from sb3_rpto.files import write_atomically
 
 Self = TypeVar("Self", bound="Resumable")
@@ -56,8 +56,6 @@ NOT_SAVED = (
 FIXED = frozenset(
     {"dynamics", "dynamics_kwargs", "declared", "close_loop", "preset", "target_data", "use_sde", "n_steps"}
 )
-#: What a VecNormalize keeps of the last step as it was.
-RAW = ("old_obs", "old_reward")
 
 
 class Resumable(TwoWorlds):
@@ -65,6 +63,8 @@ class Resumable(TwoWorlds):
 
     #: whether the policy knows the source, by a warm start or by training there
     _warm: bool
+    #: gradient steps of any fit of the dynamics at most, where the user passed a number; None where the preset says
+    fit_bound: int | None
     #: arguments that other algorithms have and this one does not use
     unused: ClassVar[frozenset[str]] = frozenset()
 
@@ -76,17 +76,41 @@ class Resumable(TwoWorlds):
     ) -> None:
         """Save all that a resumed run needs, except the replay buffers (``save_replay_buffer``); atomic for paths."""
         loaded = self._resume_state  # a loaded model that has not learned since stands where it was saved first
-        config, learner = self.dynamics_config, self.snapshots.get("learner")
+        config, learner, kwargs = self.dynamics_config, self.snapshots.get("learner"), self.replay_buffer_kwargs
         since = {"warm": self._warm, "learner": learner, "seed": self._new_seed}
         try:
             self._resume_state = {**loaded, **since} if loaded else capture(self)
             if self.env is not None:
                 self._resume_state["normalised"] = normalises(self.get_vec_normalize_env())
             self._resume_state["algorithm"] = _algorithm(type(self))
+            self._resume_state["target_size"] = kwargs.get("target_size")
             self.dynamics_config = _picklable(config)
-            write_atomically(path, lambda file: super(Resumable, self).save(file, exclude, include))
+            # SAC's buffer, in a SAC that loads the zip, has no target.
+            self.replay_buffer_kwargs = {name: value for name, value in kwargs.items() if name != "target_size"}
+            write_atomically(path, lambda file: self._write_zip(file, exclude, include))
         finally:
-            self._resume_state, self.dynamics_config = loaded, config
+            self._resume_state, self.dynamics_config, self.replay_buffer_kwargs = loaded, config, kwargs
+
+    def _write_zip(self, file: Any, exclude: Iterable[str] | None, include: Iterable[str] | None) -> None:
+        """SB3's zip, and in it what SB3 does not read, so that ``SAC.load`` takes the file."""
+        if not isinstance(file, str | pathlib.Path):  # it may be open for writing alone
+            whole = io.BytesIO()
+            self._write_zip_to(whole, exclude, include)
+            file.write(whole.getbuffer())
+        else:
+            self._write_zip_to(file, exclude, include)
+
+    def _write_zip_to(self, file: Any, exclude: Iterable[str] | None, include: Iterable[str] | None) -> None:
+        super().save(file, exclude, include)
+        zips.append_states(file, {name: recursive_getattr(self, name).state_dict() for name in self._own_states()})
+
+    def to_sac(self) -> SAC:
+        """The policy in a plain SAC of Stable-Baselines3, with its critics, temperature and optimisers.
+
+        It has no environment and no buffers, acts as this model does, learns on after ``set_env()``, and its zip needs
+        nothing of this package.
+        """
+        return sac_of_model(self)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Save both replay buffers as one pickle; atomic for paths."""
@@ -139,8 +163,9 @@ class Resumable(TwoWorlds):
         :param args: as SB3's ``load``
         :param target_env: the target, or its id
         :param kwargs: as SB3's ``load``
-        :raises ValueError: for a file that another algorithm saved, a target that is not passed by name, and arguments
-            that a saved model does not change
+        :raises ValueError: for a file that is no zip of this algorithm's, or a damaged one, a target that is not passed
+            by name, and arguments that a saved model does not change
+        :raises TypeError: for what is no path, or no environment
         """
         if args and not isinstance(args[0], str | th.device):
             raise ValueError(f"load() takes {args[0]!r} for the device; pass a target by name, as target_env=")
@@ -155,14 +180,24 @@ class Resumable(TwoWorlds):
         for name in kwargs:
             if name not in known:
                 raise ValueError(f"load() was given {name!r}, which is no argument; {near(name, known)}")
-        with one_kind_of_temperature(kwargs):
-            model = super().load(path, gym.make(env) if isinstance(env, str) else env, *args, **kwargs)
-        begin_temperature(model, kwargs.get("ent_coef"))
-        if model._resume_state is None:
+        check_given({**({"device": args[0]} if args else {}), **kwargs})
+        file = zips.located(path, "path")
+        content = zips.look_into(file, "path")
+        if "_resume_state" not in content:
+            misfit = zips.misfit_of_sac(content)
             raise ValueError(
-                f"{path} was not saved by {cls.__name__}; start from a SAC model by "
-                f"{cls.__name__}.from_source(path, env, target_env=...)"
+                f"{path} was not saved by {cls.__name__}"
+                + (f" ({misfit})" if misfit else "")
+                + f"; start from a SAC model by {cls.__name__}.from_source(path, env, target_env=...)"
             )
+        env = gym.make(env) if isinstance(env, str) else env
+        if env is not None:
+            check_environment(env, "env")
+        with one_kind_of_temperature(kwargs):
+            model = super().load(file, env, *args, **kwargs)
+        model._put_states(zips.read_states(file, model._own_states(), model.device))
+        begin_temperature(model, kwargs.get("ent_coef"))
+        assert model._resume_state is not None  # it is in the zip
         check_values_of(model)
         # The seed of its beginning is not one given now; one that was given before it was saved anew is.
         model._new_seed = None
@@ -205,21 +240,37 @@ class Resumable(TwoWorlds):
         """
 
     def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto") -> None:
-        """As in SB3; a model that was given parameters counts as warm-started and is not trained in the source."""
-        super().set_parameters(load_path_or_dict, exact_match, device)
+        """As in SB3; a model that was given parameters counts as warm-started and is not trained in the source.
+
+        The parameters are SAC's. A zip of this package brings the dynamics, too.
+        """
+        given, own = load_path_or_dict, self._own_states()
+        if not isinstance(given, dict):
+            file = zips.located(given, "load_path_or_dict")
+            given = load_from_zip_file(file, load_data=False, device=device)[1] | zips.read_states(
+                file, own, self.device
+            )
+        super().set_parameters({name: value for name, value in given.items() if name not in own}, exact_match, device)
+        self._put_states({name: value for name, value in given.items() if name in own})
         self.snapshots.pop("learner", None)  # what goes on learning is this one
         self._warm = True
 
+    def _own_states(self) -> list[str]:
+        """Names of modules and optimizers beside SAC's."""
+        if self.dynamics is None:
+            return []
+        return ["dynamics", *(["dynamics.optimizer"] if hasattr(self.dynamics, "optimizer") else [])]
+
+    def _put_states(self, states: dict[str, Any]) -> None:
+        """Restore modules and optimizers.
+
+        :param states: by the names of :meth:`_own_states`
+        """
+        for name, state in states.items():
+            recursive_getattr(self, name).load_state_dict(state)
+
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *NOT_SAVED]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, variables = super()._get_torch_save_params()
-        if self.dynamics is not None:
-            state_dicts.append("dynamics")
-            if hasattr(self.dynamics, "optimizer"):
-                state_dicts.append("dynamics.optimizer")
-        return state_dicts, variables
 
 
 def _algorithm(cls: type) -> str:
@@ -239,196 +290,3 @@ def _picklable(config: dict[str, Any] | None) -> dict[str, Any] | None:
         except Exception:  # whatever an environment's own pickling raises
             found[name] = RuleOfEnvironment(name)
     return found
-
-
-def capture(model: Resumable) -> dict[str, Any]:
-    """Where the two worlds and the random streams stand, as plain data."""
-    normaliser = None if model.env is None else model.get_vec_normalize_env()
-    return {
-        **_streams(model),
-        "source": None if model.env is None else save_state(model.env),
-        "statistics": {} if normaliser is None else save_statistics(normaliser),
-        "target": None if model.target_env is None else save_state(find_ledger(model.target_env).venv),
-        "source_world": None if model._source_world is None else model._source_world.get_state(),
-        "last_obs": model._last_obs,
-        "last_original_obs": model._last_original_obs,
-        "unstored_step": _unstored_step(model),
-        "warm": model._warm,
-        "learner": model.snapshots.get("learner"),
-    }
-
-
-def _streams(model: Resumable) -> dict[str, Any]:
-    return {
-        "random": random.getstate(),
-        "numpy": np.random.get_state(),
-        "torch": th.get_rng_state(),
-        "cuda": th.cuda.get_rng_state(model.device) if model.device.type == "cuda" else None,
-        "actions": model.action_space.np_random.bit_generator.state,
-    }
-
-
-def _unstored_step(model: Resumable) -> dict[str, Any] | None:
-    """The target step that is taken and not yet stored: SB3 calls callbacks, which may save, between the two."""
-    if model.target_env is None or model._callback is None or not find_ledger(model.target_env).unstored:
-        return None
-    normaliser = unwrap_vec_normalize(model.target_env)
-    raw = None if normaliser is None else {name: getattr(normaliser, name) for name in RAW}
-    return {"raw": raw, "known": {name: model._callback.locals[name] for name in STEP}}
-
-
-def resume(model: Resumable) -> None:
-    """Put the worlds and the random streams back to where the loaded checkpoint left them.
-
-    A world that cannot be put back begins a new episode, and a warning says which.
-    """
-    state, model._resume_state = model._resume_state, None
-    if state is None:
-        return
-    assert model.env is not None  # learn() has checked both worlds
-    began = 1 if model.target_env is None else model.target_env.num_envs
-    learned = state["last_obs"] is not None and model.num_timesteps > began and not model._offline
-    if learned and model.replay_buffer.target.size() == 0:
-        warnings.warn(
-            "the run goes on without its replay buffers, so D_target begins empty: call load_replay_buffer() with what "
-            "save_replay_buffer() wrote beside the checkpoint before learn()",
-            stacklevel=3,
-        )
-    restarted = []
-    if not _put_source_back(model, state):
-        restarted.append("source")
-    if not model._offline and state["last_obs"] is not None and not _put_target_back(model, state):
-        restarted.append("target")
-    if restarted:
-        warnings.warn(
-            f"the state of the {' and the '.join(restarted)} environment cannot be restored: a new episode begins, "
-            "so the resumed run differs from one that never stopped (it can be where the environment is built as it "
-            "was when the checkpoint was saved, and is one of gymnasium's or has save_state() and "
-            "restore_state(state), see docs/checkpoints.md)",
-            stacklevel=3,
-        )
-    _go_on_drawing(model, state)
-
-
-def resume_unbegun(model: Resumable) -> None:
-    """As :func:`resume`, of a trained model that was saved before its first step here: before all that precedes it."""
-    state = model._resume_state
-    if state is not None and state["last_obs"] is None and model._warm and not model._offline:
-        resume(model)
-
-
-def resume_source_phase(model: Resumable) -> None:
-    """Go on with the statistics and random streams of a checkpoint of the source phase, in a new episode."""
-    state, model._resume_state = model._resume_state, None
-    if state is None:
-        return
-    assert model.env is not None  # learn() has checked
-    if model._pretrained_steps > 0 and model.replay_buffer.source.size() == 0:
-        warnings.warn(
-            "the source phase goes on without its replay buffers: updates wait for learning_starts new steps; call "
-            "load_replay_buffer() with what save_replay_buffer() wrote beside the checkpoint before learn()",
-            stacklevel=3,
-        )
-    _put_env_back(model, model.env, state)
-    _go_on_drawing(model, state)
-    model._source_first_obs = np.asarray(model.env.reset())
-
-
-def leave(model: Resumable) -> None:
-    """Begin a new run with a loaded model: what the policy needs of its checkpoint stays, and a step not yet stored."""
-    state, model._resume_state = model._resume_state, None
-    if state is None:
-        return
-    normaliser = model.get_vec_normalize_env()
-    if normaliser is not None:
-        restore_statistics(normaliser, state.get("statistics", {}))
-    if model.target_env is not None and state["unstored_step"] is not None:
-        model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
-        _store_unstored_step(model, state["unstored_step"])
-
-
-def _put_env_back(model: Resumable, env: VecEnv, state: dict[str, Any]) -> bool:
-    """Restore the source; where its state is unknown, what its VecNormalize has seen all the same, and False."""
-    if _put_back(env, state["source"]):
-        return True
-    normaliser = model.get_vec_normalize_env()
-    if normaliser is not None:
-        restore_statistics(normaliser, state.get("statistics", {}))
-    return False
-
-
-def _go_on_drawing(model: Resumable, state: dict[str, Any]) -> None:
-    """Draw from the random streams that were saved, or, where a seed was given since, from new ones everywhere."""
-    seed = model._new_seed
-    if seed is None:
-        _restore_streams(model, state)
-        return
-    model.set_random_seed(seed)  # whatever was drawn since it was given
-    assert model.env is not None  # learn() has checked
-    reseed(model.env, seed)
-    if model.target_env is not None:
-        reseed(model.target_env, seed + TARGET_SEED_OFFSET)
-    if model._source_world is not None:
-        model._source_world.reseed()
-
-
-def _restore_streams(model: Resumable, state: dict[str, Any]) -> None:
-    random.setstate(state["random"])
-    np.random.set_state(state["numpy"])
-    th.set_rng_state(state["torch"])
-    if model.device.type == "cuda" and state.get("cuda") is not None:  # else it was saved on another kind of device
-        th.cuda.set_rng_state(state["cuda"], model.device)
-    model.action_space.np_random.bit_generator.state = state["actions"]
-
-
-def _put_source_back(model: Resumable, state: dict[str, Any]) -> bool:
-    """Restore the source and its episodes; False where new ones begin."""
-    assert model.env is not None  # learn() has checked
-    restored = _put_env_back(model, model.env, state)
-    if not state["source_world"] or model._source_world is None:  # branches have no episodes
-        return restored or state["source_world"] == {}
-    if restored:
-        try:
-            model._source_world.set_state(state["source_world"])
-        except ValueError:  # another number of episodes side by side, or other simulators
-            model._source_world.begin_anew()
-            restored = False
-    return restored
-
-
-def _put_target_back(model: Resumable, state: dict[str, Any]) -> bool:
-    """Restore the target, and store the step that the checkpoint carries; False where a new episode begins after it."""
-    assert model.target_env is not None
-    normaliser = unwrap_vec_normalize(model.target_env)
-    raw = {} if normaliser is None else {name: getattr(normaliser, name) for name in RAW}
-    begun = model._last_obs, model._last_original_obs, raw
-    restored = _put_back(find_ledger(model.target_env).venv, state["target"])
-    find_ledger(model.target_env).begin()
-    model._last_obs, model._last_original_obs = state["last_obs"], state["last_original_obs"]
-    if state["unstored_step"] is not None:
-        _store_unstored_step(model, state["unstored_step"])
-    if not restored:
-        model._last_obs, model._last_original_obs, raw = begun
-        if normaliser is not None:
-            vars(normaliser).update(raw)
-    return restored
-
-
-def _store_unstored_step(model: Resumable, step: dict[str, Any]) -> None:
-    """Store a step that began at the model's last observation."""
-    assert model.target_env is not None  # whose step it is
-    normaliser = unwrap_vec_normalize(model.target_env)
-    if normaliser is not None:
-        vars(normaliser).update(step["raw"])
-    model.store_step(step["known"])
-
-
-def _put_back(env: VecEnv, state: dict[str, Any] | None) -> bool:
-    """Restore a world; False, with nothing changed, without a state or with one of a world that is built otherwise."""
-    if state is None:
-        return False
-    try:
-        restore_state(env, state)
-    except ValueError:
-        return False
-    return True

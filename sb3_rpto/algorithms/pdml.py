@@ -14,6 +14,7 @@ from sb3_rpto.algorithms.mbpo import MBPO
 from sb3_rpto.algorithms.source import BranchSource, SourceWorld
 from sb3_rpto.algorithms.update import RelativeUpdate
 from sb3_rpto.dynamics.base import Transitions
+from sb3_rpto.ranges import SHARE_BELOW_1, check, whole
 
 #: Distances between policies are means over at most so many of the newest states of D_target.
 STATES = 5_000
@@ -107,10 +108,7 @@ class PDML(MBPO):
 
     def _check_numbers(self) -> None:
         super()._check_numbers()
-        if self.block_steps < 1:
-            raise ValueError(f"block_steps must be at least 1, got {self.block_steps}")
-        if not 0 <= self.newest_share < 1:
-            raise ValueError(f"newest_share must lie in [0, 1), got {self.newest_share}")
+        check({"block_steps": whole(1), "newest_share": SHARE_BELOW_1}, vars(self))
 
     def set_target_env(self, env: GymEnv | str) -> None:
         """Set the target; in the place of another one, with no blocks of it."""

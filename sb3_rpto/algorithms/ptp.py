@@ -14,6 +14,7 @@ from sb3_rpto.algorithms.regression import regress
 from sb3_rpto.algorithms.source import BranchSource, SourceWorld, sample_policy
 from sb3_rpto.algorithms.update import RelativeUpdate
 from sb3_rpto.dynamics.base import Prediction, Transitions
+from sb3_rpto.ranges import check, whole
 
 
 def squared_error(predicted: Prediction, data: Transitions, beta: float) -> th.Tensor:
@@ -176,9 +177,7 @@ class PTP(MBPO):
 
     def _check_numbers(self) -> None:
         super()._check_numbers()
-        for name in ("n_candidates", "horizon", "error_steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check(dict.fromkeys(("n_candidates", "horizon", "error_steps"), whole(1)), vars(self))
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -201,6 +200,8 @@ class PTP(MBPO):
         self.logger.record("dynamics/mean_squared_error", float(errors.mean()))
         self.logger.record("dynamics/error_network_loss", self.errors.fit(data, predicted, errors, self.error_steps))
 
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, variables = super()._get_torch_save_params()
-        return [*state_dicts, "errors", "errors.optimizer"], variables
+    def _own_states(self) -> list[str]:
+        return [*super()._own_states(), "errors", "errors.optimizer"]
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "errors"]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 
+from sb3_rpto.algorithms.answers import check_finite
 from sb3_rpto.algorithms.source import copied
-from sb3_rpto.algorithms.worlds import check_finite
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects.stance import StandingEnv
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import numpy as np
+from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import PyTorchObs
 
@@ -14,6 +15,7 @@ from sb3_rpto.algorithms.worlds import share_normalisation
 from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.deterministic import DeterministicDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
+from sb3_rpto.ranges import check, whole
 
 
 class SLBO(MBPO):
@@ -80,9 +82,8 @@ class SLBO(MBPO):
 
     def _check_numbers(self) -> None:
         super()._check_numbers()
-        for name in ("iterations", "model_steps", "policy_updates", "rollout_samples", "rollout_length"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        counts = ("iterations", "model_steps", "policy_updates", "rollout_samples", "rollout_length")
+        check(dict.fromkeys(counts, whole(1)), vars(self))
         if self.rollout_samples % self.rollout_length:
             raise ValueError(
                 f"rollout_samples={self.rollout_samples} is no multiple of rollout_length={self.rollout_length}; the "
@@ -180,6 +181,13 @@ class SLBO(MBPO):
         self.logger.record("dynamics/error", self.dynamics.error(data))
         if self._offline:  # as in fit_dynamics()
             self.dump_logs()
+
+    def to_sac(self) -> SAC:
+        """Refuse: what acts is TRPO's policy, which no SAC holds.
+
+        :raises NotImplementedError: always
+        """
+        raise NotImplementedError("SLBO acts by TRPO's policy, which no SAC holds; save it, and load it by SLBO.load()")
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -16,8 +16,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
+from sb3_rpto.algorithms.answers import Answers, check_finite
 from sb3_rpto.algorithms.update import RelativeUpdate
-from sb3_rpto.algorithms.worlds import check_finite, last_observations, share_normalisation
+from sb3_rpto.algorithms.worlds import last_observations, share_normalisation
 from sb3_rpto.dynamics.base import Dynamics, Prediction
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
@@ -95,6 +96,7 @@ class EpisodeSource(SourceWorld):
 
     def __init__(self, env: VecEnv, first_obs: np.ndarray | None = None) -> None:
         self.env = env
+        self._answers = Answers("source")
         self._normaliser = unwrap_vec_normalize(env)
         self.returns: deque[float] = deque(maxlen=100)
         self.lengths: deque[int] = deque(maxlen=100)
@@ -114,7 +116,8 @@ class EpisodeSource(SourceWorld):
         if self._left_at not in (None, whereabouts(self.env)):  # somebody stepped or reset it: its episodes are lost
             self.begin_anew()
         if self._last_obs is None:
-            self._last_obs = np.asarray(self.env.reset())
+            with self._answers.received():
+                self._last_obs = np.asarray(self.env.reset())
             self._last_raw = self._raw(self._last_obs)
         assert self._last_raw is not None  # it comes and goes with _last_obs
         model.policy.set_training_mode(False)
@@ -128,14 +131,16 @@ class EpisodeSource(SourceWorld):
                     held = 0
                 held += 1
                 actions, _ = model.policy.predict(self._last_obs, deterministic=False)
-            new_obs, rewards, dones, infos = self.env.step(actions)
+            with self._answers.received():
+                new_obs, rewards, dones, infos = self.env.step(actions)
             raw_obs, raw_next = self._last_raw, self._raw(new_obs)
             self._last_raw = raw_next.copy()
             if normaliser is not None:
                 rewards = normaliser.get_original_reward()
             for index, ended in last_observations("source", self.env, dones, infos).items():
                 raw_next[index] = ended
-            check_finite("source", observation=raw_next, reward=rewards)
+            scaled_later = normaliser is not None and normaliser.norm_reward
+            self._answers.check(raw_next, np.asarray(rewards), self.env.observation_space.shape or (), scaled_later)
             timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
             scaled = model.policy.scale_action(actions)
             model.replay_buffer.append("source", raw_obs, raw_next, scaled, rewards, dones, timeouts, infos)

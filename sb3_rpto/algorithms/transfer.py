@@ -17,7 +17,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_rpto.algorithms import arguments, checkpoint, dynamics_arguments, warm
+from sb3_rpto.algorithms import arguments, dynamics_arguments, plain_sac, resuming, settings, warm
 from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
 from sb3_rpto.algorithms.closing import LoopCloser, trace_log
 from sb3_rpto.algorithms.listeners import check_callbacks
@@ -57,7 +57,7 @@ class TransferAlgorithm(Looping):
     :param preset: hyperparameters for what is not passed: "default", "paper" or "author"
     :param dynamics: backend of the trainable source: "ensemble" (networks), "physical" (a simulator with trainable
         numbers) or "residual" (that simulator and a small ensemble on what it still misses)
-    :param dynamics_kwargs: further arguments of the backend
+    :param dynamics_kwargs: further arguments of the backend; ``max_steps`` bounds every fit, also the first, of phi_0
     :param declared: names of the physical parameters to fit (physical backend)
     :param close_loop: trace on D_target what the simulator lacks beside the declared numbers, add it to phi and go on
         (``dynamics="physical"`` on MuJoCo); a list looks for effects of these kinds alone, an empty one for
@@ -140,7 +140,7 @@ class TransferAlgorithm(Looping):
         model_train_freq: int = 250,
     ) -> None:
         self._passed |= arguments.set_among(TransferAlgorithm.__init__, locals())  # by a subclass's __init__, too
-        arguments.check_learning_rate(learning_rate)
+        settings.check_given(locals())
         if isinstance(env, str):
             env = gym.make(env)
         if env is not None:  # SB3's load() builds the object before it has an env
@@ -181,6 +181,7 @@ class TransferAlgorithm(Looping):
         self.preset = preset
         self.dynamics_backend = dynamics
         self.dynamics_kwargs = arguments.plain_effects(dynamics_kwargs or {})
+        self.fit_bound = self.dynamics_kwargs.get("max_steps")
         self.declared = arguments.list_of_names(declared)
         self.close_loop, self.retrain_steps = close_loop, retrain_steps
         #: traces what the simulator lacks, and holds the reports; None with the loop open and no log to trace on
@@ -265,6 +266,8 @@ class TransferAlgorithm(Looping):
         check_spaces(self.observation_space, self.action_space)
         # SB3 builds the buffer from these two attributes; the user's choice applies to each side.
         side_class, kwargs = self.replay_buffer_class, self.replay_buffer_kwargs
+        saved = (self._resume_state or {}).get("target_size")  # while a checkpoint is loaded
+        kwargs = {**({} if saved is None else {"target_size": saved}), **kwargs}
         own: dict[str, Any] = {name: value for name, value in kwargs.items() if name == "target_size"}
         own["side_kwargs"] = {name: value for name, value in kwargs.items() if name != "target_size"}
         if side_class not in (None, DualReplayBuffer):
@@ -296,6 +299,7 @@ class TransferAlgorithm(Looping):
         target_env: GymEnv | str | None = None,
         *,
         source_data: ReplayBuffer | str | pathlib.Path | None = None,
+        weights_only: bool = False,
         **kwargs: Any,
     ) -> Self:
         """Warm start from a SAC trained in the source: actor, critics, their targets and the temperature.
@@ -305,16 +309,23 @@ class TransferAlgorithm(Looping):
         :param target_env: the target
         :param source_data: transitions of the source (buffer, pickle or ``.npz``); D_source starts with them and the
             dynamics' phi_0 is fitted to them, instead of to fresh source steps
+        :param weights_only: read the zip without running a pickle of it, which may do anything: for a stranger's
+            (:func:`~sb3_rpto.algorithms.plain_sac.sac_of_weights`)
         :param kwargs: constructor arguments; they win over the source model's and the preset's
         :raises ValueError: when the source model's spaces are not the environment's
         """
-        sac = warm.load_sac(source_model, kwargs.get("device", "auto"))
         if isinstance(env, str):
             env = gym.make(env)
         check_environment(env, "env")
+        settings.check_given(kwargs)
+        device = kwargs.get("device", "auto")
+        if weights_only:
+            sac = plain_sac.sac_of_weights(source_model, env, kwargs.get("policy_kwargs"), device)
+        else:
+            sac = warm.load_sac(source_model, device)
         warm.check_source_spaces(sac, env)
-        settings = {**warm.carried_arguments(sac), **kwargs}
-        model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **settings)
+        given = {**plain_sac.carried_arguments(sac), **kwargs}
+        model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **given)
         # "auto" asks for a learned temperature, a number or "auto_0.5" for that one.
         warm.carry_over(sac, model, temperature=kwargs.get("ent_coef", "auto") == "auto")
         if source_data is not None:
@@ -347,15 +358,24 @@ class TransferAlgorithm(Looping):
             default 10 x ``total_timesteps``, at most 300,000; 0 skips the phase
         :raises ValueError: what :func:`~sb3_rpto.algorithms.arguments.check_ready` refuses, such as no target
         """
-        arguments.check_ready(self, total_timesteps, source_timesteps, log_interval)
+        arguments.check_ready(
+            self,
+            total_timesteps,
+            source_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
         if source_timesteps is None:
             source_timesteps = min(10 * total_timesteps, 300_000)
         if not self._warm:
             arguments.warn_of_idle_source_phase(self, source_timesteps)
         self._store_step_cut_off()
         if reset_num_timesteps and self._warm:  # else the source phase goes on all the same
-            checkpoint.leave(self)
-        checkpoint.resume_unbegun(self)
+            resuming.leave(self)
+        resuming.resume_unbegun(self)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
@@ -363,9 +383,9 @@ class TransferAlgorithm(Looping):
         self._source_world = self._source_world or self._make_source_world()
         trace_log(self)  # first of all: the log may be refused
         if not self._warm:
-            checkpoint.resume_source_phase(self)
+            resuming.resume_source_phase(self)
         self.begin_in_source(source_timesteps, progress_bar)
-        checkpoint.resume(self)
+        resuming.resume(self)
         if self.loop is not None:
             self.loop.begin(self)
         self._watch_for_null_shift()

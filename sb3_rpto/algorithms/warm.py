@@ -14,9 +14,9 @@ import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_rpto.algorithms import recorded
+from sb3_rpto.algorithms import recorded, zips
+from sb3_rpto.algorithms.answers import check_rewards
 from sb3_rpto.algorithms.checkpoint import Resumable
 from sb3_rpto.algorithms.normalisation import check_normalisation, normalises
 from sb3_rpto.algorithms.source import EpisodeSource
@@ -32,19 +32,8 @@ from sb3_rpto.tracing import Measurements
 PHI_0_STEPS, PHI_0_UPDATES = 25_000, 5_000
 #: Source steps that fill D_source before the first target step when nothing else did.
 FIRST_SOURCE_STEPS = 5_000
-#: What a warm start takes over from the source model, unless the user passes it.
-CARRIED = (
-    *("learning_rate", "batch_size", "tau", "gamma", "ent_coef", "target_entropy", "target_update_interval"),
-    *("use_sde", "sde_sample_freq", "use_sde_at_warmup"),
-)
 #: Options of an optimizer that do not decide what it keeps of each parameter.
 FREE_OPTIONS = ("params", "lr", "weight_decay", "betas", "eps", "foreach", "fused", "capturable", "differentiable")
-
-
-def carried_arguments(sac: SAC) -> dict[str, Any]:
-    """Constructor arguments that a warm start takes over from the source model."""
-    policy_kwargs = {name: value for name, value in sac.policy_kwargs.items() if name != "use_sde"}
-    return {**{name: getattr(sac, name) for name in CARRIED}, "policy_kwargs": policy_kwargs}
 
 
 def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
@@ -60,20 +49,17 @@ def load_sac(source_model: SAC | str | pathlib.Path, device: Any) -> SAC:
         return source_model
     if not isinstance(source_model, str | os.PathLike):
         raise TypeError(f"source_model must be a SAC or the path of its zip, not {type(source_model).__name__}")
+    file = zips.located(source_model, "source_model")
+    misfit = zips.misfit_of_sac(zips.look_into(file, "source_model"))
     try:
+        if misfit:
+            raise ValueError(misfit)
         # Its seed is that of its own training, and SB3 would seed the whole process with it.
-        sac = SAC.load(source_model, device=device, custom_objects={"seed": None})
-        if not isinstance(sac.policy, SACPolicy):  # TQC's zips have all that SAC asks for
-            raise TypeError(f"its policy is a {type(sac.policy).__name__}")
-        return sac
+        return SAC.load(file, device=device, custom_objects={"seed": None})
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"source_model={str(source_model)!r} is not the zip of a SAC ({error}); a model of this package goes on "
             "with its own class's load(), and what that loads may be a source_model"
-        ) from error
-    except FileNotFoundError as error:
-        raise FileNotFoundError(
-            f"source_model={str(source_model)!r}: there is no such file; pass a SAC's zip"
         ) from error
 
 
@@ -196,12 +182,17 @@ def _collect_in_source(model: Resumable, n_steps: int) -> None:
     model.env.reset()
 
 
+def phi_0_updates(model: Resumable) -> int:
+    """Gradient steps that fit phi_0 at most: a number of the user's bounds every fit, a preset's the later ones."""
+    return min(PHI_0_UPDATES, model.fit_bound or PHI_0_UPDATES)
+
+
 def _fit_phi_0(model: Resumable, dynamics: Dynamics) -> None:
     """Let the learned dynamics describe the source before the first target step (Algorithm 1's input)."""
     data = model.transitions("source")
     if model.verbose:
         print(f"fitting the model of the source to {len(data):,} transitions, which may take minutes on a CPU")
-    for name, value in dynamics.fit(data, max_steps=PHI_0_UPDATES).items():
+    for name, value in dynamics.fit(data, max_steps=phi_0_updates(model)).items():
         model.logger.record(f"dynamics/phi_0_{name}", value)
 
 
@@ -305,6 +296,8 @@ def _loaded(data: Any, model: Resumable, name: str, **how: Any) -> dict[str, np.
         raise ValueError(
             f"{name} holds actions outside [-1, 1]; scale them by policy.scale_action, as SB3's buffers do"
         )
+    if "rewards" in arrays:
+        check_rewards(f"{name} holds", arrays["rewards"])
     if not np.isin(arrays["terminations"], (0, 1)).all():
         raise ValueError(f"{name} holds values of done other than 0 and 1 (terminal, not a time limit); mend them")
     return arrays

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 
+from sb3_rpto.algorithms.answers import Answers, check_finite
 from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import layers
 from sb3_rpto.envs.state import accepts_seed, restore_state, save_state, whereabouts
@@ -43,6 +44,7 @@ class TargetLedger(VecEnvWrapper):
         self._allowance: int | None = None
         self._left_at: list[tuple[Any, ...]] | None = None
         self._stepping = False  # still so after a step that was interrupted
+        self._answers = Answers("target")
 
     @contextmanager
     def spending(self, purpose: str, allowance: int) -> Iterator[None]:
@@ -61,16 +63,19 @@ class TargetLedger(VecEnvWrapper):
         self.disturbed = self._stepping = False
         self._left_at = whereabouts(self.venv)
 
-    def check(self, observations: np.ndarray, rewards: np.ndarray, *ended: np.ndarray) -> None:
+    def check(
+        self, observations: np.ndarray, rewards: np.ndarray, *ended: np.ndarray, normalised: bool = False
+    ) -> None:
         """Look at what the target answered; if it cannot be stored, its step and its episode are given up.
 
         :param observations: after the step, or of the reset that followed
         :param rewards: of the step
         :param ended: observations at the ends of episodes
-        :raises ValueError: for what is not finite
+        :param normalised: whether VecNormalize scales the rewards before they are learned from
+        :raises ValueError: for what is not finite, or of another shape
         """
         try:
-            check_finite("target", observation=observations, reward=rewards)
+            self._answers.check(observations, rewards, self.observation_space.shape or (), normalised)
             for observation in ended:
                 check_finite("target", observation=observation)
         except ValueError:
@@ -126,7 +131,8 @@ class TargetLedger(VecEnvWrapper):
 
     def step_wait(self) -> Any:
         """The target's answer, unchanged."""
-        answer = self.venv.step_wait()
+        with self._answers.received():
+            answer = self.venv.step_wait()
         # Not before: the step may be interrupted. A step of somebody else's is none of D_target's.
         self.unstored, self._left_at = self._allowance is not None, whereabouts(self.venv)
         self._stepping = False
@@ -135,7 +141,8 @@ class TargetLedger(VecEnvWrapper):
     def reset(self) -> Any:
         """Reset the target; a reset is not counted as a step."""
         self.unstored, self.disturbed, self._stepping = False, True, False
-        answer = self.venv.reset()
+        with self._answers.received():
+            answer = self.venv.reset()
         self._left_at = whereabouts(self.venv)
         return answer
 
@@ -282,23 +289,6 @@ def check_environment(env: gym.Env | VecEnv, name: str) -> None:
         raise ValueError(
             f"{name}: reset() of {env} takes no seed=; give it the signature reset(self, *, seed=None, options=None)"
         )
-
-
-class NotFiniteError(ValueError):
-    """A world answered with NaN or infinity."""
-
-
-def check_finite(world: str, **arrays: np.ndarray) -> None:
-    """Refuse NaN and infinity before they reach a buffer.
-
-    :raises NotFiniteError: naming the world and the offending values
-    """
-    for name, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise NotFiniteError(
-                f"the {world} environment returned, as {name}, what is not finite: {array}; "
-                "mend the environment (stable_baselines3.common.vec_env.VecCheckNan finds the step)"
-            )
 
 
 def members(venv: VecEnv) -> set[int]:

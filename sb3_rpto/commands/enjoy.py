@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Run a policy and print its returns. With --video, draw the source policy in the source,
-the source policy in the target (zero-shot) and the policy in the target side by side.
+the source policy in the target (zero-shot) and the policy in the target side by side; where
+no source agent is known, as after 'train', the policy alone.
 
 MODEL is a zip, or the folder of 'sb3-rpto transfer', 'train' or 'adapt', which knows the
 environments and the source agent. After 'adapt' the target is the corrected simulator.
@@ -29,6 +30,7 @@ environments and the source agent. After 'adapt' the target is the corrected sim
 EXAMPLE = """\
 examples:
   sb3-rpto enjoy runs/hopper-rpto --video hopper.mp4
+  sb3-rpto enjoy runs/hopper --video hopper.gif
   sb3-rpto enjoy model.zip rpto/Hopper-target0-v0 --source-model source.zip --video hopper.gif
 """
 
@@ -93,7 +95,7 @@ def run(parsed: argparse.Namespace) -> int:
     if statistics is not None:
         print(f"sb3-rpto: MODEL saw observations normalised by {statistics}, here it sees them raw", file=sys.stderr)
     _check_spaces(policy, target, "MODEL", "TARGET")
-    shown = _shown(parsed, known, target) if parsed.video is not None else None
+    beside = _to_film(parsed, known, target) if parsed.video is not None else None
 
     env = target.make()
     set_random_seed(parsed.seed)  # of the actions of --stochastic
@@ -103,8 +105,8 @@ def run(parsed: argparse.Namespace) -> int:
         print(f"episode {episode + 1}: return {returns[-1]:.1f}", flush=True)
     env.close()
     print(f"mean return {np.mean(returns):.1f}, standard deviation {np.std(returns):.1f}, {len(returns)} episodes")
-    if shown is not None:
-        _film(parsed, policy, target, *shown)
+    if parsed.video is not None:
+        _film(parsed, policy, target, beside)
     return 0
 
 
@@ -140,8 +142,13 @@ def _model(path: Path) -> tuple[Path, dict[str, Any]]:
     return path / "model.zip", {name: value for name, value in known.items() if value is not None}
 
 
-def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: options.World) -> tuple[Policy, options.World]:
-    """The source policy and the source of a film; all that can fail does so here, before anything is run."""
+def _to_film(
+    parsed: argparse.Namespace, known: dict[str, Any], target: options.World
+) -> tuple[Policy, options.World] | None:
+    """The source policy and the source of a film, None for one of the policy alone.
+
+    All that can fail does so here, before anything is run.
+    """
     from sb3_rpto.commands import video
     from sb3_rpto.commands.policies import load_policy
     from sb3_rpto.zoo.settings import source_of
@@ -150,15 +157,17 @@ def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: options.Wo
     if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         os.environ.setdefault("MUJOCO_GL", "egl")  # of what draws without a display, what works
     agent = parsed.source_model or _agent_of(parsed.model, known)
-    if agent is None:
-        raise ValueError("--video compares with the source policy: pass its zip by --source-model")
-    name = parsed.source or known.get("source") or known.get("env") or source_of(target.env_id)
-    if name is None:
-        raise ValueError(f"TARGET {target.name!r} is none of our targets: pass the source's id by --source ID")
-    options.check_file(agent, "--source-model")
-    source = options.world(name, "--source")
-    policy = load_policy(agent, "--source-model")
-    _check_spaces(policy, source, "--source-model", "--source")
+    found = None
+    if agent is not None:
+        name = parsed.source or known.get("source") or known.get("env") or source_of(target.env_id)
+        if name is None:
+            raise ValueError(f"TARGET {target.name!r} is none of our targets: pass the source's id by --source ID")
+        options.check_file(agent, "--source-model")
+        source = options.world(name, "--source")
+        found = load_policy(agent, "--source-model"), source
+        _check_spaces(found[0], source, "--source-model", "--source")
+    elif parsed.source is not None:
+        raise ValueError("--source is the world of the source policy: pass its zip by --source-model, too")
     trial = target.make(render_mode="rgb_array")
     trial.reset(seed=0)
     try:
@@ -168,7 +177,7 @@ def _shown(parsed: argparse.Namespace, known: dict[str, Any], target: options.Wo
             f"--video: {target.name} cannot be drawn ({error}); unset DISPLAY, or set MUJOCO_GL=egl"
         ) from error
     trial.close()
-    return policy, source
+    return found
 
 
 def _agent_of(folder: Path, known: dict[str, Any]) -> str | None:
@@ -215,18 +224,26 @@ def _episode(env: Any, policy: Policy, seed: int | None, deterministic: bool) ->
 
 
 def _film(
-    parsed: argparse.Namespace, policy: Policy, target: options.World, source_policy: Policy, source: options.World
+    parsed: argparse.Namespace, policy: Policy, target: options.World, beside: tuple[Policy, options.World] | None
 ) -> None:
     from stable_baselines3.common.utils import set_random_seed
 
     from sb3_rpto.commands.video import Panel, film
 
-    in_source, in_target = (partial(world.make, render_mode="rgb_array") for world in (source, target))
+    in_target = partial(target.make, render_mode="rgb_array")
     panels = [
-        Panel("source policy in the source", source_policy, in_source, not parsed.stochastic),
-        Panel("source policy in the target (zero-shot)", source_policy, in_target, not parsed.stochastic),
-        Panel("transferred policy in the target", policy, in_target, not parsed.stochastic),
+        Panel(
+            "policy" if beside is None else "transferred policy in the target", policy, in_target, not parsed.stochastic
+        )
     ]
+    if beside is not None:
+        from_source, source = beside
+        in_source = partial(source.make, render_mode="rgb_array")
+        panels = [
+            Panel("source policy in the source", from_source, in_source, not parsed.stochastic),
+            Panel("source policy in the target (zero-shot)", from_source, in_target, not parsed.stochastic),
+            *panels,
+        ]
     set_random_seed(parsed.seed)
     film(panels, parsed.video, parsed.seconds, parsed.seed)
     say(f"written: {parsed.video}")

@@ -55,14 +55,12 @@ def device(text: str) -> str:
 
     :raises argparse.ArgumentTypeError: for a name that torch does not know, and a GPU that is not there
     """
-    import torch as th
+    from sb3_rpto.algorithms.settings import check_device
 
-    if text == "auto":
-        return text
     try:
-        th.empty(0, device=text)
-    except (RuntimeError, AssertionError) as error:  # torch asserts that it was built for CUDA
-        raise argparse.ArgumentTypeError(f"{text!r} cannot be used ({str(error).splitlines()[0]})") from error
+        check_device(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
     return text
 
 
@@ -147,21 +145,19 @@ def check_sac(settings: dict[str, Any]) -> None:
     """
     from stable_baselines3 import SAC
 
-    from sb3_rpto.algorithms.arguments import check_sac_values
+    from sb3_rpto.algorithms.settings import OF_SAC
+    from sb3_rpto.ranges import check
 
     own = {name: p.default for name, p in inspect.signature(SAC).parameters.items()} | settings
-    check_sac_values(**{name: own[name] for name in inspect.signature(check_sac_values).parameters})
     rate = own["learning_rate"]
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not rate > 0:
         raise ValueError(f"--set learning_rate is {rate!r}; give a number above 0 (schedules: the Python interface)")
-    first = own["learning_starts"]
-    if isinstance(first, bool) or not isinstance(first, int) or first < 0:
-        raise ValueError(f"--set learning_starts is {first!r}; give a number of steps")
     if own["optimize_memory_usage"]:
         raise ValueError("--set optimize_memory_usage: a transfer needs the next observations; leave it out")
     for name in ("action_noise", "replay_buffer_class", "replay_buffer_kwargs"):
         if own[name] is not None:
             raise ValueError(f"--set {name}: it takes an object of Python; use the Python interface")
+    check(OF_SAC, {name: value for name, value in own.items() if name != "policy"} | settings)
 
 
 def check_learns(settings: dict[str, Any], steps: int) -> None:

@@ -51,7 +51,9 @@ def run(parsed: argparse.Namespace) -> int:
         import pandas as pd
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError(f"plot needs matplotlib and pandas ({error}): pip install 'sb3-rpto[experiments]'") from error
+        raise ImportError(
+            f"plot needs matplotlib and pandas ({error}): pip install -e '.[experiments]' in the checkout"
+        ) from error
     from sb3_rpto.files import write_atomically
 
     rows = pd.DataFrame(read_rows(parsed.results))

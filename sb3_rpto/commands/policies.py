@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.save_util import load_from_zip_file
 
+from sb3_rpto.algorithms import zips
 from sb3_rpto.algorithms.slbo import SLBO
 
 
@@ -37,13 +38,10 @@ def load_policy(path: str | Path, argument: str) -> Policy:
     :param argument: what the user passed it as
     :raises ValueError: for a file that is no model of SB3's
     """
+    zips.look_into(path, argument)
     constant = {"lr_schedule": lambda _: 0.0, "learning_rate": 0.0}
-    try:
-        data, parameters, _ = load_from_zip_file(path, device="cpu", custom_objects=constant)
-    except (ValueError, KeyError) as error:
-        raise ValueError(f"{argument} {str(path)!r} is no zip of a model: {error}") from error
-    if not data or "policy_class" not in data:
-        raise ValueError(f"{argument} {str(path)!r} is no zip of a model of Stable-Baselines3")
+    data, parameters, _ = load_from_zip_file(path, device="cpu", custom_objects=constant)
+    assert data is not None  # it was looked into
     if "trpo.policy" in parameters:  # SLBO acts by TRPO's policy, beside which it keeps SAC's
         return SLBO.load(path, device="cpu")
     kwargs = dict(data.get("policy_kwargs", {}))

@@ -53,7 +53,7 @@ def require(path: Path) -> None:
     needed = ("imageio", "PIL", *(("imageio_ffmpeg",) if path.suffix == ".mp4" else ()))
     missing = [name for name in needed if find_spec(name) is None]
     if missing:
-        raise ImportError(f"--video needs {', '.join(missing)}: pip install 'sb3-rpto[video]'")
+        raise ImportError(f"--video needs {', '.join(missing)}: pip install -e '.[video]' in the checkout")
 
 
 def film(panels: Sequence[Panel], path: Path, seconds: float, seed: int) -> list[float]:

@@ -17,6 +17,7 @@ from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_e
 from sb3_rpto.effects.names import near
 from sb3_rpto.envs.cartpole import CartPoleParameters, cartpole_reward, cartpole_step, cartpole_termination
 from sb3_rpto.envs.rules import changing_wrappers
+from sb3_rpto.ranges import MAPPING, NONE, POSITIVE, check, whole
 
 #: The constants that may be declared, with their default bounds; None is a tenth to ten times the nominal value.
 DECLARABLE: dict[str, tuple[float, float] | None] = {
@@ -138,8 +139,7 @@ class CartPoleDynamics(Dynamics):
                 f"CartPoleDynamics simulates the cart-pole (4 observations, 1 action), not spaces of shape "
                 f"{observation_space.shape} and {action_space.shape}; it is chosen by itself for ContinuousCartPole"
             )
-        if not max_step > 0:
-            raise ValueError(f"max_step must be positive, not {max_step!r}")
+        check({"max_step": POSITIVE, "max_steps": whole(1), "bounds": MAPPING | NONE}, locals())
         self.nominal = _complete(constants)
         self._thresholds = CartPoleParameters(**self.nominal)
         self.declared = _checked_names(declared)
@@ -198,9 +198,12 @@ class CartPoleDynamics(Dynamics):
 
     def describe(self) -> dict[str, float]:
         """The declared constants by name, in their units."""
-        values = self.values(self.coordinates.detach().double()).tolist()
+        phi = self.coordinates.detach().double()
+        lower, upper = th.tensor([self.bounds[name] for name in self.declared], dtype=th.float64, device=phi.device).T
         # exp(log(bound)) may miss the bound by a rounding error, and a friction of -1e-18 is no world.
-        return {name: min(max(x, self.bounds[name][0]), self.bounds[name][1]) for name, x in zip(self.declared, values)}
+        values = self.values(phi).clamp(lower, upper)
+        values = th.where(phi <= self._lower, lower, th.where(phi >= self._upper, upper, values))
+        return dict(zip(self.declared, values.tolist()))
 
     @th.no_grad()
     def step(self, observations: th.Tensor, actions: th.Tensor, deterministic: bool = False) -> Prediction:

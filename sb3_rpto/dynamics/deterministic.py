@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from sb3_rpto.dynamics.base import Prediction, Transitions, predecessors
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics, TransitionFn
+from sb3_rpto.ranges import check, whole
 
 #: Predictions are kept within so many standard deviations of the states that the scaler saw.
 FARTHEST = 100.0
@@ -84,8 +85,7 @@ class DeterministicDynamics(EnsembleDynamics):
         horizon: int = 2,
         max_steps: int = 5000,
     ) -> None:
-        if horizon < 1:
-            raise ValueError(f"horizon must be at least 1, got {horizon}")
+        check({"horizon": whole(1)}, {"horizon": horizon})
         super().__init__(
             observation_space,
             action_space,

@@ -16,10 +16,21 @@ from gymnasium import spaces
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
 from sb3_rpto.dynamics.networks import Heads, StackedNetworks
 from sb3_rpto.dynamics.products import fast_products, no_denormals
+from sb3_rpto.ranges import FLAG, POSITIVE, WIDTHS, Rule, check, number, whole
 
 #: a known rule of the task, in torch: (observations, actions, next_observations) -> (n,)
 TransitionFn: TypeAlias = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
 
+#: what the constructor's arguments may be
+RULES = {
+    **dict.fromkeys(("reward_fn", "termination_fn"), Rule("be a function or None", lambda x: x is None or callable(x))),
+    **dict.fromkeys(("n_members", "n_elites", "batch_size", "max_holdout", "patience", "max_steps"), whole(1)),
+    "hidden": WIDTHS,
+    "learning_rate": POSITIVE,
+    "holdout_ratio": number("be in (0, 0.5]", lambda x: 0 < x <= 0.5),
+    "min_holdout_for_elites": whole(0),
+    "noise": FLAG,
+}
 #: gradient steps between two looks at the holdout, where an epoch has fewer
 MIN_STEPS_PER_EPOCH = 20
 #: what counts as an improvement for the patience, relative to the member's holdout error (MBPO)
@@ -119,14 +130,9 @@ class EnsembleDynamics(Dynamics):
                     f"{name} holds {space.dtype}, and the model predicts changes; wrap the environments in "
                     "gymnasium.wrappers.DtypeObservation(env, np.float32) or give it a Box of floats"
                 )
-        if not 1 <= n_elites <= n_members:
+        check(RULES, locals())
+        if n_elites > n_members:
             raise ValueError(f"n_elites must be in 1..n_members ({n_members}), got {n_elites}")
-        if not 0.0 < holdout_ratio <= 0.5:
-            raise ValueError(f"holdout_ratio must be in (0, 0.5], got {holdout_ratio}")
-        positive = {"batch_size": batch_size, "max_holdout": max_holdout, "patience": patience, "max_steps": max_steps}
-        for name, value in positive.items():
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
         self.reward_fn = reward_fn
         self.termination_fn = termination_fn
         self.n_members = n_members
@@ -219,8 +225,7 @@ class EnsembleDynamics(Dynamics):
         """
         started = time.perf_counter()
         max_steps = self.max_steps if max_steps is None else max_steps
-        if max_steps < 1:
-            raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+        check(RULES, {"max_steps": max_steps})
         with fast_products(self.device), no_denormals():
             train, held = self._prepare(data, weights, rows)
             best_nll, best_error = self._judge(held)

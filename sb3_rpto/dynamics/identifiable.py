@@ -13,7 +13,9 @@ LOAD = 0.05
 
 
 def null_directions(normal: np.ndarray, shown: np.ndarray) -> np.ndarray:
-    """Directions in which phi moves no residual although its parameters do one by one, (p, k), unit length, in scales.
+    """Directions in which phi moves no residual although its parameters do one by one, (p, k), orthonormal, in scales.
+
+    Their span alone is determined: shares in it do not depend on the directions that the solver takes for it.
 
     :param normal: Gauss-Newton matrix of the residuals by phi in scales, (p, p)
     :param shown: parameters that move residuals at all, (p,); the others belong to no direction
@@ -26,7 +28,7 @@ def null_directions(normal: np.ndarray, shown: np.ndarray) -> np.ndarray:
     found = vectors[:, eigenvalues < NULL * eigenvalues[-1]]
     directions = np.zeros((len(normal), found.shape[1]))
     directions[free] = found / size[free, None]
-    return np.asarray(directions / np.linalg.norm(directions, axis=0))
+    return np.asarray(np.linalg.qr(directions)[0])
 
 
 def entangled(directions: np.ndarray) -> np.ndarray:

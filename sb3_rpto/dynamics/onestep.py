@@ -10,6 +10,7 @@ import torch as th
 from scipy.optimize import lsq_linear
 
 from sb3_rpto.dynamics.base import Transitions, predecessors
+from sb3_rpto.dynamics.box import stepped
 from sb3_rpto.dynamics.identifiable import entangled, null_directions, to_hold
 from sb3_rpto.effects import Simulation
 from sb3_rpto.effects.actuation import command_limits
@@ -240,15 +241,15 @@ class OneStep:
         shown = _shown(a, b)
         self.unseen &= ~shown
         free = np.flatnonzero(shown & ~self.held & ~self.left)
-        moved = values.copy()
+        step = np.zeros(len(values))
         if len(free):
             a, b = _ridged(a[:, free], b)
             low, high = ((bound - values)[free] / self.scale[free] for bound in (self.lower, self.upper))
             far = reach * np.maximum(1.0, np.abs(values[free]) / self.scale[free])
             # The solver wants boxes with an inside.
             box = np.minimum(np.maximum(low, -far), -1e-12), np.maximum(np.minimum(high, far), 1e-12)
-            moved[free] += lsq_linear(a, b, box, method="bvls").x * self.scale[free]
-        return np.clip(moved, self.lower, self.upper)
+            step[free] = lsq_linear(a, b, box, method="bvls").x * self.scale[free]
+        return stepped(values, step, self.lower, self.upper)
 
     def _weighted(self, residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The least squares ``a x = b`` of a step x in scales: (n c, p) and (n c,)."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from numbers import Integral, Real
 from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
@@ -29,6 +28,16 @@ from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.observations import StateMap, are_known, noise_of_each, single_env, whole_state
 from sb3_rpto.envs.steps import place_as_after_a_step
+from sb3_rpto.ranges import NOT_NEGATIVE, POSITIVE, THREADS, check, of_type, whole
+
+#: What the constructor's arguments may be.
+RULES = {
+    "max_step": POSITIVE,
+    **dict.fromkeys(("max_steps", "frame_skip"), whole(1)),
+    "randomise": NOT_NEGATIVE,
+    "threads": THREADS,
+    **dict.fromkeys(("declared", "effects"), of_type("be a list", list, tuple)),
+}
 
 #: A fit stops when no parameter moves by more than this share of its scale.
 STILL = 1e-6
@@ -97,16 +106,7 @@ class PhysicalDynamics(Dynamics):
         observation_noise: float | Sequence[float] | None = None,
     ) -> None:
         super().__init__(observation_space, action_space)
-        for name, value, least in (
-            ("max_step", max_step, 1e-9),
-            ("max_steps", max_steps, 1),
-            ("randomise", randomise, 0),
-        ):
-            if not isinstance(value, Real) or not least <= value < np.inf:
-                raise ValueError(f"{name} must be a finite number of at least {least:g}, not {value!r}")
-        for name, value in (("max_steps", max_steps), ("threads", threads)):
-            if not isinstance(value, Integral) or isinstance(value, bool) or value < 0:
-                raise ValueError(f"{name} must be an integer that is not negative, not {value!r}")
+        check(RULES, locals())
         model = model.compile() if isinstance(model, PlainModel) else load_model(model)[1]
         recover = whole_state(model.nq, model.nv) if recover is None else recover
         if action_space.shape != (model.nu,):
@@ -119,6 +119,8 @@ class PhysicalDynamics(Dynamics):
         self.model, self.recover, self.frame_skip = model, recover, frame_skip
         self.max_step, self.max_steps, self.randomise = max_step, max_steps, randomise
         self.threads = threads
+        #: whether the last fit came to its end, or phi would have moved on with more steps
+        self.settled = False
         self.observation_noise = (
             None if observation_noise is None else noise_of_each(observation_noise, recover, "observation_noise")
         )
@@ -384,6 +386,7 @@ class PhysicalDynamics(Dynamics):
             values, taken = self._descend(problem, begin, most)
             vague = problem.vague(values, begin)
         self._values.copy_(th.as_tensor(values))
+        self.settled = taken < most
         if taken and not self.runs_on(data):
             self._values.copy_(th.as_tensor(begin))
             warnings.warn(

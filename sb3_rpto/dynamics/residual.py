@@ -16,6 +16,7 @@ from sb3_rpto.dynamics.ensemble import EnsembleDynamics, TransitionFn
 from sb3_rpto.dynamics.onestep import as_steps
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import Effect
+from sb3_rpto.ranges import MAPPING, NONE, check
 
 #: The ensemble, unless it is told otherwise. The simulator is deterministic, so its predicted variance is doubt.
 SMALL: Mapping[str, Any] = {
@@ -75,6 +76,7 @@ class ResidualDynamics(Dynamics):
         **physical_kwargs: Any,
     ) -> None:
         super().__init__(observation_space, action_space)
+        check({"ensemble_kwargs": MAPPING | NONE}, {"ensemble_kwargs": ensemble_kwargs})
         self.reward_fn, self.termination_fn = reward_fn, termination_fn
         self.physical = PhysicalDynamics(observation_space, action_space, **physical_kwargs)
         # A residual neither ends an episode nor has a reward: no head learns those.

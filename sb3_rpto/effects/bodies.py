@@ -30,6 +30,27 @@ class MassScale(Effect):
 
 
 @register
+class InertiaScale(Effect):
+    r"""A body whose inertia is :math:`1 + c` times as much at the same mass: MuJoCo's ``body_inertia`` alone.
+
+    So it is where masses were changed and inertias were not, as scripts that write ``body_mass`` alone do.
+    """
+
+    kind = "inertia_scale"
+    place = "body"
+    parameters = (Parameter("change", "", 0.1, lower=-0.95, upper=29.0),)
+    equation = "(1 + change) inertia, the mass as it is"
+    native = "inertial"
+    excite = "angular accelerations"
+    same = ("inertia",)
+    offered = False
+
+    def write(self, world: World, x: np.ndarray) -> None:
+        """Scale the body's inertia."""
+        world.field("body_inertia")[:, self.index] *= 1 + x
+
+
+@register
 class Payload(Effect):
     r"""A point mass at a body: at :math:`p =` ``along`` :math:`\cdot c` from its origin, where c is its centre of mass.
 
@@ -182,7 +203,7 @@ class GravityTilt(Effect):
     def write(self, world: World, x: np.ndarray) -> None:
         """Turn gravity."""
         gravity = world.field("opt.gravity")
-        gravity[:] = np.einsum("nij,nj->ni", rotations(x[:, 0], x[:, 1]), gravity)
+        gravity[:] = (rotations(x[:, 0], x[:, 1]) * gravity[:, None]).sum(axis=2)
 
 
 @register

@@ -25,7 +25,7 @@ from sb3_rpto.effects.stance import StandingEnv, nominal_heights
 from sb3_rpto.effects.units import units_at
 from sb3_rpto.effects.world import LiveWorld
 from sb3_rpto.effects.wrapper import CorrectedEnv, active, own
-from sb3_rpto.files import write_bytes
+from sb3_rpto.files import write_together
 
 FORMAT = 1
 #: What reading a file raises that holds other things than :func:`save_corrected` writes.
@@ -106,6 +106,23 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
         ``folder`` holds a ``model.xml`` that must not be overwritten: the nominal one, or none of this function's
     :raises FileNotFoundError: an asset is missing
     """
+    write_files(folder, corrected_files(folder, source, effects))
+
+
+def write_files(folder: str | os.PathLike[str], contents: Mapping[str, bytes]) -> None:
+    """Write files into a folder, all of them or none.
+
+    :param folder: made if missing
+    :param contents: by path in it
+    """
+    found = {Path(folder) / name: content for name, content in contents.items()}
+    for path in found:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_together(found)
+
+
+def corrected_files(folder: str | os.PathLike[str], source: ModelSource, effects: Sequence[Effect]) -> dict[str, bytes]:
+    """What :func:`save_corrected` writes, by path in the folder; arguments and errors as there."""
     check_free(folder, file_of(source))
     spec, nominal = load_model(source)
     if spec is None:
@@ -131,12 +148,7 @@ def save_corrected(folder: str | os.PathLike[str], source: ModelSource, effects:
         "heights": nominal_heights(nominal),
         "exact": rounded(plain, model),
     }
-    folder = Path(folder)
-    (folder / "assets" if assets else folder).mkdir(parents=True, exist_ok=True)
-    for name, content in assets.items():
-        write_bytes(folder / name, content)
-    write_bytes(folder / "model.xml", text.encode())
-    write_bytes(folder / "effects.json", json.dumps(stored, indent=1).encode())
+    return {**assets, "model.xml": text.encode(), "effects.json": json.dumps(stored, indent=1).encode()}
 
 
 def check_free(folder: str | os.PathLike[str], file: Path | None) -> None:

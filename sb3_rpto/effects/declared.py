@@ -44,6 +44,9 @@ class Declared(Effect):
     place = "world"
     equation = "a number of the model"
     known = True
+    #: of friction that the model has none of: whether it gives way near rest as MuJoCo's ``frictionloss`` by default
+    #: does, in place of the stiffest constraint that the time step allows
+    soft: bool = False
 
     def __init__(
         self,
@@ -106,6 +109,11 @@ class Declared(Effect):
         return self.owner, self.index, self.label.rpartition(".")[2]
 
     @property
+    def firm(self) -> bool:
+        """Whether it is dry friction of a joint that has none in the model, and holds as a machine's does."""
+        return self.number[::2] == ("joint", "frictionloss") and self.nominal == 0 and not self.soft
+
+    @property
     def rank(self) -> int:
         """Its turn among declared parameters: factors come after what they multiply."""
         return {"mass": 1, "inertia": 2, "strength": 3}.get(self.label.rpartition(".")[2], 0)
@@ -141,7 +149,10 @@ class Declared(Effect):
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Write the parameter's field."""
-        self._how.write(world, self.index, x[:, 0], self.nominal)
+        if self.soft:
+            world.field("dof_frictionloss")[:, self.dof] = x[:, 0]
+        else:
+            self._how.write(world, self.index, x[:, 0], self.nominal)
 
 
 def _find(model: mujoco.MjModel, name: str) -> tuple[str, int, Number]:

@@ -15,6 +15,8 @@ from sb3_rpto.effects.world import World
 Place = Literal["joint", "actuator", "body", "geom", "world", "sensor"]
 #: What an effect acts by; it overrides at least one.
 HOOKS = ("write", "act", "command", "observe", "late")
+#: So many starts spread over the range of a shape that has two bounds.
+SPREAD = 6
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,8 @@ class Parameter:
     :param upper: largest value
     :param null: value at which the effect does nothing; for a shape parameter (any value does) where a fit starts
     :param shape: True when the parameter means nothing while the others are at their null values
-    :param starts: where a fit may start as well, in sizes from the null: there a shape may hide what the others do, and
-        a limit that nothing reaches does nothing
+    :param starts: where a fit may start as well, in sizes from the null; default: :meth:`spread` for a shape, else
+        none. At the null a shape may hide what the others do, and a limit that nothing reaches does nothing
     :param own: field of the model that it adds to, e.g. ``"dof_damping"`` or ``"opt.density"``: values may go below
         ``lower`` by what the model has there, for a target that has less of it
     """
@@ -67,6 +69,32 @@ class Parameter:
     def size_for(self, scales: Scales) -> float:
         """:attr:`size` where things are as large as ``scales`` says."""
         return float(self.size(scales) if callable(self.size) else self.size)
+
+    def starts_for(self, size: float) -> list[float]:
+        """Values other than the null where a fit may start, within the bounds.
+
+        :param size: see :meth:`size_for`
+        """
+        if not self.starts and self.shape:
+            return self.spread(size)
+        return [float(np.clip(self.null + start * size, self.lower, self.upper)) for start in self.starts]
+
+    def spread(self, size: float) -> list[float]:
+        """Values over the range of a shape: even ones between two bounds, tenfold either way above one, else in sizes.
+
+        :param size: see :meth:`size_for`
+        """
+        if np.isfinite(self.upper - self.lower):
+            share = (np.arange(SPREAD) + 0.5) / SPREAD
+            return [float(value) for value in self.lower + share * (self.upper - self.lower)]
+        ways = 10.0 ** np.array([-1.5, -1.0, -0.5, 0.5, 1.0])
+        if self.lower >= 0 and self.null > 0:
+            return [float(value) for value in self.null * ways if value > self.lower]
+        return [
+            float(np.clip(self.null + sign * way * size, self.lower, self.upper))
+            for way in (1.0, 3.0, 10.0)
+            for sign in (-1, 1)
+        ]
 
 
 class Effect:

@@ -41,8 +41,8 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
     actuator's ``gain``, ``gear`` or ``strength`` command_gain, its ``kp`` or ``strength`` servo_gain,
     its ``kv`` servo_damping or, of a velocity servo, velocity_servo_gain, ``option.density`` and ``option.viscosity``
     fluid. A declared mass leaves payload in: it moves the centre of mass too.
-    soft_friction, held forces and gravity_scale, which no machine has, mass_scale, com_offset, contact_softness,
-    external_force, command_offset and command_smoothing are left out unless they are named.
+    soft_friction, held forces and gravity_scale, which no machine has, mass_scale, inertia_scale, com_offset,
+    contact_softness, external_force, command_offset and command_smoothing are left out unless they are named.
 
     :param model: the compiled model
     :param exclude: names of declared parameters, as :func:`~sb3_rpto.effects.declare` takes them
@@ -62,13 +62,16 @@ def candidates(model: mujoco.MjModel, exclude: Iterable[str] = (), kinds: Contai
     return found
 
 
-def given(model: mujoco.MjModel, declared: Sequence[str], known: Sequence[Effect] = ()) -> list[Effect]:
+def given(
+    model: mujoco.MjModel, declared: Sequence[str], known: Sequence[Effect] = (), soft: bool = False
+) -> list[Effect]:
     """What a model has from the start: declared numbers at their nominal values, and effects that are known beforehand.
 
     :param model: the compiled model
     :param declared: names, as :func:`~sb3_rpto.effects.declare` takes them
     :param known: effects of the library with the values that are known; declared numbers among them count as declared,
         and begin where the model has them
+    :param soft: whether declared friction of joints that have none in the model gives way near rest, as MuJoCo's own
     :raises ValueError: a name or an effect that the model does not have, or has twice; a known effect that does nothing
     :raises TypeError: ``known`` holds something else
     """
@@ -85,7 +88,10 @@ def given(model: mujoco.MjModel, declared: Sequence[str], known: Sequence[Effect
             )
     # Bounds are those of the last entry: what the user declared.
     names = [*(effect.label for effect in known if isinstance(effect, Declared)), *declared]
-    found: list[Effect] = [*declare(model, names)]
+    numbers = declare(model, names)
+    for number in numbers:
+        number.soft = soft and number.firm
+    found: list[Effect] = [*numbers]
     everywhere, free = ({e.label for e in candidates(model, taken, LIBRARY)} for taken in ((), names))
     for effect in [effect for effect in known if not isinstance(effect, Declared)]:
         label = effect.label

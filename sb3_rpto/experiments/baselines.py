@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_rpto.algorithms import warm
 from sb3_rpto.algorithms.arguments import begin_temperature, one_kind_of_temperature
 from sb3_rpto.algorithms.distil import SquashedMeanPolicy, clone, clone_kwargs
+from sb3_rpto.algorithms.plain_sac import carried_arguments
 from sb3_rpto.algorithms.regression import regress
 from sb3_rpto.algorithms.source import EpisodeSource, make_source_world
 from sb3_rpto.algorithms.update import as_transitions
@@ -144,7 +145,7 @@ def with_more_critics(
     check_critics(source, n_critics)
     old = source.critic.q_networks
     fixed = {"learning_starts": 0, "n_steps": source.n_steps, "seed": seed, "device": device}
-    arguments = {**warm.carried_arguments(source), **fixed, **settings}
+    arguments = {**carried_arguments(source), **fixed, **settings}
     arguments["policy_kwargs"] = {**arguments["policy_kwargs"], "n_critics": n_critics}
     model = SAC("MlpPolicy", target, **arguments)
     model.actor.load_state_dict(source.actor.state_dict())

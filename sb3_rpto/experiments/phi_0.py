@@ -33,14 +33,14 @@ def fit_once(model: TransferAlgorithm, folder: Path) -> None:
     if made_by is not None and made_by.endswith("-dirty"):
         return
     data = model.transitions("source")
-    settings = [json_text(model.dynamics_config), str(model.device), warm.PHI_0_UPDATES, versions(), made_by]
+    settings = [json_text(model.dynamics_config), str(model.device), warm.phi_0_updates(model), versions(), made_by]
     path = folder / f"phi_0_{_digest([vars(data), dynamics.state_dict(), settings])}.pt"
     if path.is_file():
         kept = th.load(path, map_location=model.device, weights_only=True)
         dynamics.load_state_dict(kept["model"])
         dynamics.optimizer.load_state_dict(kept["optimizer"])
         return
-    dynamics.fit(data, max_steps=warm.PHI_0_UPDATES)
+    dynamics.fit(data, max_steps=warm.phi_0_updates(model))
     state = {"model": dynamics.state_dict(), "optimizer": dynamics.optimizer.state_dict()}
     write_atomically(path, lambda file: th.save(state, file), "pt")
 

@@ -121,7 +121,7 @@ def run(
         raise ValueError(f"backend is {backend!r}; choose one of {BACKENDS}")
     if importlib.util.find_spec(backend) is None:
         extra = "ray" if backend == "ray" else "experiments"
-        raise ImportError(f"backend {backend!r} needs the package: pip install 'sb3-rpto[{extra}]'")
+        raise ImportError(f"backend {backend!r} needs the package: pip install -e '.[{extra}]' in the checkout")
     known = _manifest(folder, suite)
     (folder / "runs").mkdir(parents=True, exist_ok=True)
 

@@ -214,7 +214,8 @@ def creeping(problem: Problem, values: np.ndarray, named: Sequence[int]) -> tupl
     """
     simulation = problem.simulation
     there = [e for i, e in enumerate(simulation.effects) if i in named or e.known]
-    firm = [e for e in there if e.kind in DRY and simulation.model.dof_frictionloss[e.dof] == 0]
+    dry = [e for e in there if e.kind in DRY or (isinstance(e, Declared) and e.firm)]
+    firm = [e for e in dry if simulation.model.dof_frictionloss[e.dof] == 0]
     if not firm:
         return [], 1.0
     places = [s for e, s in zip(simulation.effects, simulation.slices) if e in there]

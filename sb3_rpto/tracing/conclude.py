@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 from sb3_rpto.effects import LIBRARY, Declared, Effect
 from sb3_rpto.tracing.adequacy import SETTLED, TOLERANCE, adequacy, judge
@@ -38,8 +39,16 @@ UNLIKE = Finding(
     "fitted runs",
     "the runs set apart to select on do not show what is missing in the others: blocks of all of them take turns",
 )
-#: Recordings, whether they are of a simulator's own steps, and the kinds of effects to look for.
-Prepared = Callable[[Measurements, bool, Sequence[str] | None], SetUp]
+
+
+class Prepared(Protocol):
+    """Reads recordings for a search."""
+
+    def __call__(self, data: Measurements, simulated: bool, kinds: Sequence[str] | None, soft: bool = False) -> SetUp:
+        """Recordings, whether they are of a simulator's own steps, and the kinds of effects to look for.
+
+        :param soft: whether declared dry friction gives way near rest, see :func:`~sb3_rpto.effects.library.given`
+        """
 
 
 @dataclass(frozen=True)
@@ -85,8 +94,8 @@ def conclude(
     """
 
     def read(data: Measurements, simulated: bool) -> tuple[SetUp, Found]:
-        def searched(kinds: Sequence[str] | None) -> tuple[SetUp, Found]:
-            set_up = prepared(data, simulated, kinds)
+        def searched(kinds: Sequence[str] | None, soft: bool = False) -> tuple[SetUp, Found]:
+            set_up = prepared(data, simulated, kinds, soft)
             found = search(set_up)
             if hidden(found, seed):
                 set_up = set_up.with_all_to_fit()
@@ -94,9 +103,9 @@ def conclude(
                 found = search(set_up)
             return set_up, found
 
-        (set_up, found), softer = searched(kinds), _softer(kinds)
-        if softer and not _explains(found) and _creeps(found):
-            other, then = searched(softer)
+        set_up, found = searched(kinds)
+        if not _explains(found) and _creeps(found):
+            other, then = searched(_softer(kinds), soft=True)
             if _explains(then) or then.after.ratio < found.after.ratio:
                 set_up, found = other, then
                 set_up.findings.append(SOFT)
@@ -165,10 +174,10 @@ def _held_beside(found: Found) -> list[str]:
 
 
 def _softer(kinds: Sequence[str] | None) -> list[str]:
-    """The same kinds of effects, with friction that gives way in the place of the dry ones; none without those."""
+    """The same kinds of effects, with friction that gives way in the place of the dry ones."""
     kinds = kinds if kinds is not None else [name for name, kind in LIBRARY.items() if kind.offered]
     others = [kind for kind in kinds if kind not in DRY]
-    return [*others, "soft_friction"] if len(others) < len(kinds) else []
+    return [*others, "soft_friction"] if len(others) < len(kinds) else others
 
 
 def _is_exact(set_up: SetUp, found: Found, declared: Sequence[str], threads: int) -> bool:

@@ -59,7 +59,9 @@ def require() -> None:
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
-        raise ImportError("the figures of a report need matplotlib: pip install 'sb3-rpto[tracing]'") from error
+        raise ImportError(
+            "the figures of a report need matplotlib: pip install -e '.[tracing]' in the checkout"
+        ) from error
 
 
 def draw(rows: int, columns: int, paint: Callable[[np.ndarray], None], height: float = 2.5) -> str:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sb3_rpto.dynamics.box import bounded_step, stepped
 from sb3_rpto.effects import Declared, Scales, Simulation
-from sb3_rpto.tracing.box import bounded_step
 from sb3_rpto.tracing.interpolation import between, interpolate
 from sb3_rpto.tracing.loss import Loss
 from sb3_rpto.tracing.starts import moved, straight
@@ -334,7 +334,7 @@ class Problem:
         moves = np.stack([share * (reduced.move + follow) for share in SHARES])
         trial_starts = np.tile(starts, (len(SHARES), tries, 1, 1))
         trial_starts[..., self.moving] -= moves
-        trial_values = values + steps
+        trial_values = stepped(values, steps, self.lower, self.upper)
         r = self.residuals(
             np.tile(np.repeat(trial_values, count, 0), (len(SHARES), 1)),
             trial_starts.reshape(len(SHARES) * tries * count, -1),
@@ -363,6 +363,19 @@ class Problem:
         pull = np.where(self.known[free], 0.0, 1 / RIDGE**2)
         z = (values[free] - self.null[free]) / self.size[free]
         return reduced.normal.sum(0) + np.diag(pull), reduced.gradient.sum(0) + pull * z
+
+    def bounded_fall(self, linear: Linear, values: np.ndarray) -> float:
+        """How far the cost would fall within the bounds of the free parameters if it were quadratic.
+
+        :param linear: the cost around ``values``, (p,)
+        """
+        free, normal, gradient = linear.free, linear.normal.sum(0), linear.gradient.sum(0)
+        if not len(free):
+            return 0.0
+        damped = normal + 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(free))
+        low, high = ((b[free] - values[free]) / self.size[free] for b in (self.lower, self.upper))
+        z = bounded_step(damped, gradient, np.minimum(low, 0.0), np.maximum(high, 0.0))
+        return float(-2 * gradient @ z - z @ normal @ z)
 
     def linear(self, fit: Fit, free: np.ndarray) -> Linear:
         """The reduced normal equations at a fit, for screening, elimination and intervals."""

@@ -49,9 +49,19 @@ def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarra
         intervals = np.clip(intervals, problem.lower, problem.upper)
         intervals[:, hidden] = intervals[:, alike] = np.nan
         inverse = _inverse(linear.normal.sum(0))
-        size = np.sqrt(np.diag(inverse))
-        correlation[np.ix_(free, free)] = inverse / np.outer(size, size)
+        correlation[np.ix_(free, free)] = correlations(inverse)
     return values, intervals, correlation
+
+
+def correlations(covariance: np.ndarray) -> np.ndarray:
+    """The correlations of a covariance (f, f): symmetric, from -1 to 1, and 1 on the diagonal, whatever its rounding.
+
+    :param covariance: positive on the diagonal
+    """
+    size = np.sqrt(np.diag(covariance))
+    found = np.clip((covariance + covariance.T) / (2 * np.outer(size, size)), -1, 1)
+    np.fill_diagonal(found, 1.0)
+    return np.asarray(found)
 
 
 def half_widths(linear: Linear, block: np.ndarray) -> np.ndarray:

@@ -186,7 +186,7 @@ class Likes:
     def _likest(self, effect: int, kept: Sequence[int]) -> list[int]:
         """What to try in the place of an effect: kinds that are kept elsewhere first, as joints are built alike."""
         kinds, cosine = {self.kinds[i] for i in kept}, self.screening.cosine[effect]
-        near = [i for i in np.argsort(-cosine).tolist() if cosine[i] > LIKE]
+        near = [i for i in np.argsort(-cosine, kind="stable").tolist() if cosine[i] > LIKE]
         near = [i for i in near if i != effect and i not in kept and self.screening.excited(i)]
         return sorted(near, key=lambda i: self.kinds[i] not in kinds)[:SUBSTITUTES]
 

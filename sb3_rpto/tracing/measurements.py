@@ -126,7 +126,7 @@ class Measurements:
         try:
             import pandas
         except ImportError as error:
-            message = "reading Parquet needs pandas and pyarrow: pip install 'sb3-rpto[experiments,data]'"
+            message = "reading Parquet needs pandas and pyarrow: pip install -e '.[experiments,data]' in the checkout"
             raise ImportError(message) from error
         tables = {}
         for path in _expand(paths):

@@ -346,13 +346,13 @@ def _correlate(parts: list[_Force]) -> tuple[np.ndarray, np.ndarray] | None:
             if len(p.given) > 3 * lag
         ]
         needed, given = (np.concatenate(x) for x in zip(*pairs)) if pairs else (np.empty(0), np.empty(0))
-        spread = np.std(given) if len(given) else 0.0
-        if len(given) < _FEWEST or spread <= 1e-9 * (1 + np.abs(given).max()) or np.std(needed) == 0:
+        # What is constant varies by rounding.
+        if len(given) < _FEWEST or any(np.std(x) <= 1e-9 * (1 + np.abs(x).max()) for x in (needed, given)):
             if lag == 0:
                 return None
             continue
         correlations[lag] = np.corrcoef(needed, given)[0, 1]
-        slopes[lag] = correlations[lag] * np.std(needed) / spread
+        slopes[lag] = correlations[lag] * np.std(needed) / np.std(given)
     return correlations, slopes
 
 

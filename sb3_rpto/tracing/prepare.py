@@ -135,10 +135,13 @@ def prepare(
     threads: int,
     known: Sequence[Effect] = (),
     simulated: bool = False,
+    soft: bool = False,
 ) -> SetUp:
     """Check the data against the model, part them, measure their noise, and set up the simulations.
 
     Parameters and errors as :func:`sb3_rpto.tracing.trace.trace`.
+
+    :param soft: see :func:`~sb3_rpto.effects.library.given`
     """
     spec, compiled = load_model(model)
     data = replace(data, simulated=data.simulated or simulated)
@@ -179,7 +182,7 @@ def prepare(
     touching &= not data.exact  # those are met, or fits begin anew until they are
     train, select, test, fitted = (replace(d, touching=touching) for d in (train, select, test, fitted))
     nominal = discretised(roomy, fitted, fine=True)
-    there = given(nominal, declared, known)
+    there = given(nominal, declared, known, soft)
     if seems == "machine" and not data.exact:
         findings += soft_friction(nominal) + soft_ties(nominal) + carried_weights(nominal)
     settings = {Declared(nominal, name, (-np.inf, np.inf)).number: name for name in data.columns.params}

@@ -94,7 +94,9 @@ def from_minari(dataset: Any, env: gym.Env | VecEnv | None = None) -> Measuremen
         try:
             import minari
         except ImportError as error:
-            raise ImportError("reading a Minari dataset needs minari: pip install 'sb3-rpto[data]'") from error
+            raise ImportError(
+                "reading a Minari dataset needs minari: pip install -e '.[data]' in the checkout"
+            ) from error
         dataset = minari.load_dataset(dataset)
     env = dataset.recover_environment() if env is None else single_env(env)
     runs = []

@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects import Declared, Effect, Simulation
-from sb3_rpto.effects.carry import carried_by, check_free, save_corrected
+from sb3_rpto.effects.carry import carried_by, check_free, corrected_files, write_files
 from sb3_rpto.effects.mjcf import PlainModel
-from sb3_rpto.files import json_text, plain, write_text
+from sb3_rpto.files import json_text, plain
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import Adequacy
 from sb3_rpto.tracing.checks import Finding
@@ -398,7 +398,7 @@ class Report:
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write ``report.html``, ``report.json`` and the corrected model (``model.xml`` and ``effects.json``).
 
-        :param folder: made if absent; files in it are replaced one by one, each whole
+        :param folder: made if absent; files in it are replaced together, once all are written
         :return: the folder
         :raises ImportError: matplotlib is not installed; nothing is written then
         :raises ValueError: the model came as an ``MjModel``, whose MJCF nothing tells; nothing is written then. Where
@@ -409,13 +409,12 @@ class Report:
         out = Path(folder)
         # Rendered before anything is written: what fails there leaves the folder as it was.
         page, data = render(self), json_text(self.to_json())
+        files = {"report.json": f"{data}\n".encode(), "report.html": page.encode()}
         try:
             check_free(out, self.file)
-            save_corrected(out, self.source, self.correction)
+            files = {**corrected_files(out, self.source, self.correction), **files}
         finally:
             # After a long trace, a file that is missing must not lose what was found.
             if not isinstance(self.source, mujoco.MjModel):
-                out.mkdir(parents=True, exist_ok=True)
-                write_text(out / "report.json", data + "\n")
-                write_text(out / "report.html", page)
+                write_files(out, files)
         return out

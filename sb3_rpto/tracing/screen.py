@@ -13,6 +13,8 @@ from sb3_rpto.tracing.loss import Loss
 EXCITED = 4.0
 #: Candidates whose influences are closer than this are one class.
 SAME = 0.98
+#: Digits of likenesses: of what is alike up to rounding, the first in the library's order is the likest.
+DIGITS = 9
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def screen(problem: Problem, fit: Fit) -> Screening:
             if len(roots[a]) and len(roots[b]):
                 canonical = np.linalg.svd(roots[a] @ even[np.ix_(groups[a], groups[b])] @ roots[b].T, compute_uv=False)
                 # The smaller group must lie in the larger one.
-                cosine[a, b] = cosine[b, a] = float(np.clip(canonical.min(), 0, 1))
+                cosine[a, b] = cosine[b, a] = round(float(np.clip(canonical.min(), 0, 1)), DIGITS)
     return Screening(sensitivity, cosine, _taken(problem, reduced.normal.sum(0), sensitivity))
 
 
@@ -82,7 +84,7 @@ def _taken(problem: Problem, normal: np.ndarray, sensitivity: np.ndarray) -> lis
     groups = [np.flatnonzero(np.isin(strength, np.arange(s.start, s.stop))) for s in simulation.slices]
     known = [e for e, effect in enumerate(simulation.effects) if effect.known]
     size = np.sqrt(np.maximum(np.diag(normal), 1e-12))
-    likeness = np.abs(normal / size / size[:, None])
+    likeness = np.abs(normal / size / size[:, None]).round(DIGITS)
     taken: list[int | None] = []
     for e, g in enumerate(groups):
         alone = np.sqrt(max(0.0, float(np.linalg.eigvalsh(normal[np.ix_(g, g)])[-1]))) if len(g) else 0.0

@@ -14,7 +14,7 @@ from sb3_rpto.tracing.concentrate import led_on
 from sb3_rpto.tracing.evidence import GAIN, Evidence, compare, folds, several_missed
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.loss import FAR
-from sb3_rpto.tracing.shapes import places_to_begin
+from sb3_rpto.tracing.shapes import Begin, beginnings
 from sb3_rpto.tracing.unseen import unseen_errors
 from sb3_rpto.tracing.windows import Windows, join
 
@@ -399,27 +399,37 @@ class Selector:
         some = np.arange(0, len(self.train.windows), 3)
         part, begin = self.train.on(some), model.fit.starts[some]
         base = part.fit(model.fit.values, self.free(model.effects), begin, 3)
-        gains, begins = {}, {}
-        for e in self._promised(part, base, model.effects, outside):
+        gains, fits, starts = {}, {}, {}
+        for e, begins in self._promised(part, base, model.effects, outside).items():
             free = self.free([*model.effects, e])
-            tried = places_to_begin(part, base, self.free(model.effects), e)
-            trials = [(v, part.fit(v, free, base.starts, REFIT + 1)) for v in tried]
-            values, fit = min(trials, key=lambda trial: trial[1].cost)
-            gains[e] = max(float(np.mean(np.log(base.errors) - np.log(fit.errors))), 1 - fit.cost / base.cost)
-            s = self.simulation.slices[e]
-            begins[e] = replace(model.fit, values=model.fit.values.copy(), linear=None)
-            begins[e].values[s] = values[s]
+            trials = [(b.values, part.fit(b.values, free, base.starts, REFIT + 1)) for b in begins]
+            starts[e], fits[e] = min(trials, key=lambda trial: trial[1].cost)
+            gained = float(np.mean(np.log(base.errors) - np.log(fits[e].errors)))
+            gains[e] = max(gained, 1 - fits[e].cost / base.cost)
         best = sorted(gains, key=lambda e: -gains[e])[:PROMISING]
-        return [(e, begins[e]) for e in best if gains[e] > GAIN]
+        return [(e, self._begun(model, e, starts[e], fits[e].values)) for e in best if gains[e] > GAIN]
 
-    def _promised(self, part: Problem, base: Fit, kept: Sequence[int], outside: Sequence[int]) -> list[int]:
-        """The effects outside that promise most to first order, and those that may promise more from another start."""
-        every = self.free([*kept, *outside])
-        linear = part.linear(base, every)
-        rows = {e: np.flatnonzero(np.isin(every, self.free([*kept, e]))) for e in outside}
-        falls = {e: linear.fall(rows[e]) for e in outside}
-        best = sorted(outside, key=lambda e: -falls[e])[:QUICK]
-        return [e for e in outside if e in best or any(p.starts for p in self.simulation.effects[e].parameters)]
+    def _begun(self, model: Model, effect: int, start: np.ndarray, fitted: np.ndarray) -> Fit:
+        """Where the fit of a model with one more effect begins: at what some windows led to where all err less there.
+
+        :param start: parameters with those of the effect where the fit to some windows began, (p,)
+        :param fitted: where it ended, (p,)
+        """
+        there = self.train.score(fitted, model.fit.starts)
+        if there.cost < model.fit.cost:
+            return replace(there, linear=None)
+        s, values = self.simulation.slices[effect], model.fit.values.copy()
+        values[s] = start[s]
+        return replace(model.fit, values=values, linear=None)
+
+    def _promised(
+        self, part: Problem, base: Fit, kept: Sequence[int], outside: Sequence[int]
+    ) -> dict[int, list[Begin]]:
+        """The effects outside that promise most to first order from any of their starts, with the best of those."""
+        begins = beginnings(part, base, self.free(kept), outside)
+        best = sorted(outside, key=lambda e: -begins[e][0].fall)
+        sure = sum(begins[e][0].fall == np.inf for e in outside)
+        return {e: begins[e] for e in best[: QUICK + sure]}
 
 
 def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:

@@ -13,6 +13,7 @@ import numpy as np
 from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.model import file_of
 from sb3_rpto.effects.units import units_at
+from sb3_rpto.ranges import SEED, THREADS, check, whole
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import SETTLED
 from sb3_rpto.tracing.cautions import (
@@ -101,8 +102,8 @@ def trace(
     _check_arguments(data, seed, candidates, horizon, calibrate, threads)
     say = _steady(progress)
 
-    def prepared(data: Measurements, simulated: bool, kinds: Sequence[str] | None) -> SetUp:
-        return prepare(model, data, declared, seed, kinds, horizon, threads, known, simulated)
+    def prepared(data: Measurements, simulated: bool, kinds: Sequence[str] | None, soft: bool = False) -> SetUp:
+        return prepare(model, data, declared, seed, kinds, horizon, threads, known, simulated, soft)
 
     def search(on: SetUp) -> Found:
         at, finer = partial(on.selectors, say=say), partial(on.finer, say=say)
@@ -274,9 +275,7 @@ def _check_arguments(
     number = isinstance(horizon, Real) and not isinstance(horizon, bool)
     if horizon is not None and not (number and 0 < horizon < np.inf):
         raise ValueError(f"horizon is {horizon!r}; give a time in s above 0, or None")
-    for name, value in (("seed", seed), ("calibrate", calibrate), ("threads", threads)):
-        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 0:
-            raise ValueError(f"{name} is {value!r}; give a whole number from 0")
+    check({"seed": SEED, "calibrate": whole(0), "threads": THREADS}, locals())
 
 
 def _declared(simulation: Simulation, values: np.ndarray, intervals: np.ndarray) -> list[Traced]:

@@ -1,4 +1,4 @@
-"""Masses that nobody declared, where nothing explains recordings: a model often has them from a drawing."""
+"""Masses and inertias that nobody declared, where nothing explains recordings: models have them from drawings."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from sb3_rpto.tracing.search import Found
 from sb3_rpto.tracing.unreached import Hint
 from sb3_rpto.tracing.windows import cut
 
-#: A body is looked at with these changes of its mass; those that promise most are fitted.
+#: A body is looked at with these changes of each; those that promise most are fitted.
 LOOKS = (-0.3, 0.4)
+#: The effects that change them, and what to declare then.
+DECLARE = {"mass_scale": "mass", "inertia_scale": "inertia"}
 
 
 def undeclared_mass(found: Found, set_up: SetUp) -> list[Hint]:
-    """The body with another mass of which the model errs far less, with what was found as far as that is needed then.
+    """The body with another mass or inertia of which the model errs far less, with what was found where it is needed.
 
-    Its inertia goes with it. Of a machine's recordings no effect that is looked for does the same: a ``payload`` is a
-    point. In exact data ``mass_scale`` is among the candidates.
+    With a mass its inertia goes; a declared mass leaves the inertia that did not go with it. Of a machine's recordings
+    no effect that is looked for does the same: a ``payload`` is a point. In exact data both are among the candidates.
     """
     data, train = set_up.fitted, found.on.fine.train
     if data.exact:
@@ -36,22 +38,23 @@ def undeclared_mass(found: Found, set_up: SetUp) -> list[Hint]:
     usual = min(float(np.median(fit.errors)) for fit in fits)
     declared = [effect.label for effect in simulation.effects if isinstance(effect, Declared)]
     tried = []
-    for mass in candidates(set_up.nominal, declared, {"mass_scale"}):
-        wider = Simulation(simulation.model, [*simulation.effects, mass], simulation.nthread)
+    for scale in candidates(set_up.nominal, declared, DECLARE):
+        wider = Simulation(simulation.model, [*simulation.effects, scale], simulation.nthread)
         there = Problem(wider, windows, [*train.scales, Scales()])
         for values in (np.append(begin, change) for begin in begins for change in LOOKS):
-            tried.append((float(np.median(there.score(values).errors)), values, there, mass.on))
+            tried.append((float(np.median(there.score(values).errors)), values, there, scale))
     best, share = None, CLEARLY
-    for _, values, there, body in sorted(tried, key=lambda one: one[0])[:FITTED]:
+    for _, values, there, scale in sorted(tried, key=lambda one: one[0])[:FITTED]:
         fit = there.fit(values, np.append(free, simulation.size), iterations=ITERATIONS)
         if (now := float(np.median(fit.errors)) / usual) < share:
-            best, share = (body, 1 + fit.values[-1]), now
+            best, share = (scale, 1 + fit.values[-1]), now
     if best is None:
         return []
-    body, times = best
+    scale, times = best
+    what = DECLARE[scale.kind]
     message = (
-        f"with {times:.3g} times its mass the model errs by {share:.0%} of what it does: declare {body}.mass, "
+        f"with {times:.3g} times its {what} the model errs by {share:.0%} of what it does: declare {scale.on}.{what}, "
         "and trace again"
     )
-    where = frozenset({object_id(set_up.nominal, "body", body)})
-    return [Hint("undeclared mass", body, message, bodies=where, left=share)]
+    where = frozenset({object_id(set_up.nominal, "body", scale.on)})
+    return [Hint(f"undeclared {what}", scale.on, message, bodies=where, left=share)]

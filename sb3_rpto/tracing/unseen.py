@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_rpto.tracing.box import bounded_step
+from sb3_rpto.dynamics.box import bounded_step, stepped
 from sb3_rpto.tracing.identify import Fit, Problem
 
 #: Windows left out move a parameter as if it were known beforehand to this many plausible sizes, to the power of -2:
@@ -34,5 +34,7 @@ def unseen_errors(
         for others, judged in folds:
             normal, gradient = linear.normal[others].sum(0), linear.gradient[others].sum(0)
             normal = normal + np.diag(1e-3 * np.diag(normal) + UNTOLD)
-            rows[np.ix_(judged, free)] += bounded_step(normal, gradient, low, high) * problem.size[free]
+            step = bounded_step(normal, gradient, low, high) * problem.size[free]
+            begin, lower, upper = (x[free] for x in (fit.values, problem.lower, problem.upper))
+            rows[np.ix_(judged, free)] = stepped(begin, step, lower, upper)
     return problem.score(rows, fit.starts, iterations=1).errors

@@ -11,4 +11,6 @@ def require() -> None:
     try:
         import rl_zoo3  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"the zoo needs rl_zoo3 and Optuna ({error}): pip install 'sb3-rpto[zoo]'") from error
+        raise ImportError(
+            f"the zoo needs rl_zoo3 and Optuna ({error}): pip install -e '.[zoo]' in the checkout"
+        ) from error

@@ -26,10 +26,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
+from sb3_rpto.algorithms.answers import NotFiniteError
 from sb3_rpto.algorithms.bookkeeping import TARGET_SEED_OFFSET
+from sb3_rpto.algorithms.plain_sac import carried_arguments
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
-from sb3_rpto.algorithms.warm import carried_arguments, check_source_spaces, load_sac
-from sb3_rpto.algorithms.worlds import NotFiniteError
+from sb3_rpto.algorithms.warm import check_source_spaces, load_sac
 from sb3_rpto.zoo.samplers import SAMPLERS
 from sb3_rpto.zoo.settings import ALGORITHMS, section, settings_beside, shipped_file, source_of, target_beside
 
@@ -238,6 +239,15 @@ class TransferManager(ExperimentManager):
         super()._save_config(saved_hyperparams)
 
     # ------------------------------------------------------------------ models
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """As the zoo's, with the zip's suffix: the folder of its settings has the same name without it."""
+        env_name = self.env_name
+        self.env_name = f"{env_name}.zip"
+        try:
+            super().save_trained_model(model)
+        finally:
+            self.env_name = env_name
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         """The model to train: a checkpoint that goes on, or a new one."""

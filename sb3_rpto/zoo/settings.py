@@ -23,7 +23,33 @@ ALGORITHMS: dict[str, type[TransferAlgorithm]] = {
     **{"rpo": RPO, "rto": RTO, "rpto": RPTO},
     **{"mbpo": MBPO, "ptp": PTP, "pdml": PDML, "slbo": SLBO},
 }
+#: How YAML tags what is an object of Python's.
+_PYTHON = "tag:yaml.org,2002:python/"
 _FOLDER = resources.files("sb3_rpto") / "hyperparams" / "zoo"
+
+
+class _Object:
+    """Stands for an object of Python's: making it would run whatever the file says."""
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Reads what the zoo writes, plain data in an OrderedDict, and makes no other object."""
+
+
+def _ordered(loader: yaml.SafeLoader, node: yaml.SequenceNode) -> dict[Any, Any]:
+    (pairs,) = loader.construct_sequence(node, deep=True)
+    return dict(pairs)
+
+
+_PlainLoader.add_constructor(f"{_PYTHON}object/apply:collections.OrderedDict", _ordered)
+_PlainLoader.add_constructor(f"{_PYTHON}tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))
+_PlainLoader.add_multi_constructor(_PYTHON, lambda loader, suffix, node: _Object())
+
+
+def _holds_object(value: Any) -> bool:
+    if isinstance(value, dict):
+        return any(map(_holds_object, (*value, *value.values())))
+    return any(map(_holds_object, value)) if isinstance(value, list | tuple) else isinstance(value, _Object)
 
 
 def source_of(target_id: str) -> str | None:
@@ -70,11 +96,22 @@ def shipped_algorithms() -> list[str]:
 def settings_beside(trained_agent: str, name: str) -> dict[str, Any]:
     """What the zoo saved of the run of a zip; nothing where it is not in such a run's folder.
 
+    Objects of Python's, which the file could have run anything by, are left out.
+
     :param trained_agent: the zip
     :param name: ``config.yml``, the settings, or ``args.yml``, the command's arguments
+    :raises ValueError: the file is none of the zoo's
     """
     found = sorted(Path(trained_agent).parent.glob(f"*/{name}"))
-    return dict(yaml.unsafe_load(found[0].read_text())) if len(found) == 1 else {}  # it holds an OrderedDict's tag
+    if len(found) != 1:
+        return {}
+    try:
+        settings = yaml.load(found[0].read_text(encoding="utf-8"), Loader=_PlainLoader)
+    except yaml.YAMLError as error:
+        raise ValueError(f"{found[0]} is no YAML of the zoo's ({error}); mend it, or take the zip elsewhere") from error
+    if not isinstance(settings, dict):
+        raise ValueError(f"{found[0]} holds no settings by name; mend it, or take the zip elsewhere")
+    return {key: value for key, value in settings.items() if not _holds_object(value)}
 
 
 def target_beside(trained_agent: str) -> str | None:

@@ -1,10 +1,13 @@
 """What is refused before anything is built, each check by itself."""
 
 import warnings
+import zipfile
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from conftest import ALGORITHMS, SMALL_ENSEMBLE, pendulum, small
 from gymnasium import spaces
 from sb3_contrib import TQC
@@ -15,26 +18,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms import arguments
+from sb3_rpto.algorithms import arguments, settings
 from sb3_rpto.effects import LIBRARY, declare
-
-VALUES = {
-    "dynamics": "ensemble",
-    "weighting": "paper",
-    "rollout_start": "mix",
-    "real_ratio": 0.05,
-    "weight_floor": 0.5,
-    "source_steps": 20,
-    "model_train_freq": 250,
-    "gradient_steps": -1,
-    "target_update_interval": 1,
-    "tau": 0.005,
-    "gamma": 1.0,
-    "batch_size": 256,
-    "buffer_size": 1_000,
-    "train_freq": (1, "step"),
-    "retrain_steps": 0,
-}
 
 
 class Matrix(gym.Env):
@@ -54,37 +39,140 @@ def test_actions_that_are_not_flat_are_refused_at_construction(cls):
 
 
 def test_what_is_allowed_passes():
-    arguments.check_values(**VALUES)
+    settings.check_given(
+        {
+            **{
+                "policy": "MlpPolicy",
+                "learning_rate": lambda _: 1e-3,
+                "buffer_size": np.int64(10),
+                "learning_starts": 0,
+            },
+            **{"train_freq": (1, "episode"), "gradient_steps": -1, "ent_coef": "auto_0.5", "target_entropy": -1.0},
+            **{
+                "policy_kwargs": {"net_arch": {"pi": [8], "qf": []}, "use_sde": False},
+                "verbose": True,
+                "seed": 2**32 - 1,
+            },
+            **{"tensorboard_log": Path("logs"), "source_steps": "auto", "weighting": None, "gamma": 1, "device": "cpu"},
+            **{"use_sde": np.bool_(True), "ent_coef": 0, "dynamics_kwargs": {}, "device": th.device("cpu")},
+        }
+    )
     arguments.check_supported(1, False, None)
     arguments.check_applicable("RPO", False, {"env", "real_ratio"})
     arguments.check_applicable("RPTO", True, arguments.DYNAMICS_ARGUMENTS)
 
 
+#: What a constructor refuses, by the argument, whatever else it is given.
+WRONG = {
+    "policy": ["MlpPolcy", 3],
+    "learning_rate": [-1e-3, float("nan")],
+    "buffer_size": [0, 2.5, "1000", None, 10**15, 10**30],
+    "learning_starts": [-1, 1.5, None],
+    "batch_size": [0, "64", True],
+    "tau": [0.0, 5.0, "0.1"],
+    "gamma": [1.5, float("nan"), None],
+    "train_freq": [0, (1, "epoch"), (0, "step"), [1, "step"], "step"],
+    "gradient_steps": [2.5, "5"],
+    "action_noise": [0.1, NormalActionNoise],
+    "replay_buffer_class": [3, dict],
+    "replay_buffer_kwargs": [[1], {"target_size": 10**15}],
+    "optimize_memory_usage": ["yes"],
+    "n_steps": [0, "2"],
+    "ent_coef": ["autoo", "auto_", "auto_-1", "auto_0", -0.1, float("inf"), None],
+    "target_update_interval": [0],
+    "target_entropy": ["aut", None],
+    "use_sde": ["yes", 2],
+    "sde_sample_freq": [-2, 0.5],
+    "use_sde_at_warmup": ["no"],
+    "stats_window_size": [0],
+    "tensorboard_log": [3],
+    "policy_kwargs": [
+        [1],
+        "net_arch",
+        {"net_arc": [8]},
+        {"net_arch": [0]},
+        {"net_arch": 64},
+        {"net_arch": {"pi": [8]}},
+    ],
+    "verbose": ["2", -1],
+    "seed": ["a", -1, 1.5, 2**32],
+    "device": ["cuda:9", "gpu", 3.5],
+    "preset": ["defalt", 3],
+    "dynamics": ["gp", ["ensemble"]],
+    "dynamics_kwargs": [[1], "hidden"],
+    "weighting": ["centered", ["paper"]],
+    "rollout_start": ["middle"],
+    "real_ratio": [1.0, -0.1, "0.1"],
+    "weight_floor": [-1e-9, "0.5", float("inf")],
+    "retrain_steps": [-1, 2.5],
+    "source_steps": [0, "autoo", 2.5],
+    "model_train_freq": [2.5, 0],
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_value_is_named_with_what_it_must_be(name):
+    for value in WRONG[name]:
+        with pytest.raises(
+            ValueError, match=rf"^{name}.*(must|does not exist|cannot be used|has no argument|do not fit into)"
+        ):
+            RPTO(**{"policy": "MlpPolicy", "env": pendulum(), "target_env": pendulum(12.0), name: value})
+
+
+def test_load_and_from_source_look_at_their_arguments_before_the_zip():
+    for name in set(WRONG) - {"policy", "preset", "dynamics", "dynamics_kwargs", "use_sde", "n_steps"}:
+        value = WRONG[name][0]
+        for make in (
+            lambda **given: RPTO.load("nowhere", **given),
+            lambda **given: RPTO.from_source("n", pendulum(), **given),
+        ):
+            with pytest.raises(ValueError, match=rf"^{name}"):
+                make(**{name: value})
+
+
+#: The same of the backends' arguments.
+WRONG_DYNAMICS = {
+    "hidden": [(), 64, [0], "64", [8, 1.5], {8}],
+    "n_members": [0, 2.5],
+    "n_elites": [0, 9],
+    "learning_rate": [0, "1e-3"],
+    "batch_size": [0],
+    "holdout_ratio": [0.6, "0.2"],
+    "patience": [0],
+    "max_steps": [0, 2.5],
+    "min_holdout_for_elites": [-1],
+    "noise": ["no"],
+    "reward_fn": [3],
+}
+
+
+@pytest.mark.parametrize("name", WRONG_DYNAMICS)
+def test_a_wrong_value_of_the_ensemble_is_named(name):
+    for value in WRONG_DYNAMICS[name]:
+        with pytest.raises(ValueError, match=rf"^(dynamics_kwargs\[')?{name}.* must"):
+            small(RPTO, dynamics_kwargs={name: value, **({} if name == "reward_fn" else RULES)})
+
+
+RULES = {"termination_fn": lambda o, a, n: th.zeros(len(o), dtype=th.bool)}
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("dynamics", "gp"),
-        ("weighting", "centered"),
-        ("rollout_start", "middle"),
-        ("real_ratio", 1.0),
-        ("real_ratio", -0.1),
-        ("weight_floor", -1e-9),
-        ("retrain_steps", -1),
-        ("retrain_steps", 2.5),
-        ("source_steps", "auto"),
-        ("source_steps", 0),
-        ("model_train_freq", 2.5),
-        ("gradient_steps", 2.5),
-        ("gradient_steps", "5"),
-        ("target_update_interval", 0),
-        ("tau", 0.0),
-        ("tau", 5.0),
-        ("gamma", 1.5),
+        *(("total_timesteps", value) for value in (0, -5, 2.5, "10", True)),
+        *(("source_timesteps", value) for value in (-1, 2.5, "10")),
+        *(("callback", value) for value in ("x", 3, [3])),
+        *(("log_interval", value) for value in (0, -1, "4")),
+        ("tb_log_name", 3),
+        ("reset_num_timesteps", "no"),
+        ("progress_bar", 1),
     ],
 )
-def test_a_wrong_value_is_named(name, value):
-    with pytest.raises(ValueError, match=f"^{name}"):
-        arguments.check_values(**{**VALUES, name: value})
+def test_learn_names_a_wrong_argument_before_a_step(name, value):
+    model = small(RPO)
+    with pytest.raises(ValueError, match=f"^{name} must"):
+        model.learn(**{"total_timesteps": 10, name: value})
+    assert (model.num_timesteps, model.source_timesteps) == (0, 0)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +211,7 @@ def test_rules_that_answer_in_another_form_are_refused_at_once(rule, answer):
 
 
 def test_a_fit_of_no_steps_is_refused_at_once():
-    with pytest.raises(ValueError, match="max_steps must be at least 1"):
+    with pytest.raises(ValueError, match="max_steps must be a positive integer"):
         small(RPTO, dynamics_kwargs={**SMALL_ENSEMBLE, "max_steps": 0})
 
 
@@ -198,8 +286,8 @@ def test_effects_need_not_be_plain_data():
         (TypeError, {"dynamics_kwargs": {"effects": LIBRARY["command_delay"]("slide", delay=0.03)}}, "a list of effe"),
         (TypeError, {"dynamics_kwargs": {"effects": ["command_delay"]}}, r"effects or their to_json\(\), not 'comm"),
         (ValueError, {"dynamics_kwargs": {"effects": [{"kind": "command_delay"}]}}, "it lacks on, values"),
-        (ValueError, {"dynamics_kwargs": {"max_steps": 2.5}}, "max_steps must be an integer"),
-        (ValueError, {"dynamics_kwargs": {"threads": -1}}, "threads must be an integer that is not negative"),
+        (ValueError, {"dynamics_kwargs": {"max_steps": 2.5}}, "max_steps must be a positive integer"),
+        (ValueError, {"dynamics_kwargs": {"threads": -1}}, "threads must be a number of threads from 1"),
         (TypeError, {"close_loop": None}, "close_loop must be True, False or a list"),
         (TypeError, {"close_loop": 1}, "close_loop must be True, False or a list"),
     ],
@@ -341,8 +429,60 @@ def test_a_source_model_of_another_kind_is_refused(agent, error, tmp_path):
 
 def test_a_zip_of_tqc_is_no_sacs_though_it_loads_as_one(tmp_path):
     TQC("MlpPolicy", pendulum(), policy_kwargs={"net_arch": [4]}, buffer_size=10).save(tmp_path / "tqc.zip")
-    with pytest.raises(ValueError, match=r"is not the zip of a SAC \(its policy is a TQCPolicy"):
+    with pytest.raises(ValueError, match=r"is not the zip of a SAC \(another .* a policy of sb3_contrib\.tqc"):
         RPTO.from_source(tmp_path / "tqc.zip", pendulum(), pendulum(12.0))
+
+
+@pytest.mark.parametrize("agent", [PPO, TD3, TQC])
+def test_load_says_that_a_zip_is_another_algorithms(agent, tmp_path):
+    agent("MlpPolicy", pendulum(), policy_kwargs={"net_arch": [4]}).save(tmp_path / "other.zip")
+    of_policy = agent.policy_aliases["MlpPolicy"].__module__
+    with pytest.raises(
+        ValueError, match=rf"other.zip was not saved by RPTO \(.* a policy of {of_policy}\).*from_source"
+    ):
+        RPTO.load(tmp_path / "other.zip", pendulum(), target_env=pendulum(12.0))
+
+
+def _no_zips(folder):
+    """Paths that hold no whole zip of a model, by what is to be said of them."""
+    PPO("MlpPolicy", pendulum(), policy_kwargs={"net_arch": [4]}).save(folder / "whole.zip")
+    whole = (folder / "whole.zip").read_bytes()
+    (folder / "cut.zip").write_bytes(whole[: len(whole) // 2])
+    (folder / "text.zip").write_text("no zip at all")
+    (folder / "flipped.zip").write_bytes(whole.replace(b'"policy_class"', b'"policy_clash"', 1))
+    (folder / "empty").mkdir()
+    with zipfile.ZipFile(folder / "photos.zip", "w") as archive:
+        archive.writestr("beach.png", b"")
+    return {
+        "cut.zip": "is a zip that was cut off; copy it anew",
+        "text.zip": "is no zip of a model",
+        "flipped.zip": "is damaged at its entry 'data'",
+        "empty": "is a folder, without the zip of a model",
+        ".": "is a folder; pass the zip of a model, such as 'cut.zip' in it",
+        "photos.zip": "is no zip of a model of Stable-Baselines3",
+    }
+
+
+def test_what_is_no_whole_zip_of_a_model_is_told(tmp_path):
+    for name, said in _no_zips(tmp_path).items():
+        with pytest.raises(ValueError, match=f"path=.*{said}"):
+            RPTO.load(tmp_path / name)
+        with pytest.raises(ValueError, match=f"source_model=.*{said}"):
+            RPTO.from_source(tmp_path / name, pendulum())
+    with pytest.raises(ValueError, match="is a zip that was cut off"), (tmp_path / "cut.zip").open("rb") as file:
+        RPTO.load(file)
+    with pytest.raises(FileNotFoundError, match=r"path='nowhere': there is no such file"):
+        RPTO.load("nowhere")
+    with pytest.raises(TypeError, match="path must be the path of a zip or an open file, not dict"):
+        RPTO.load({})
+
+
+def test_a_zip_without_its_suffix_is_found_beside_a_folder_of_that_name(tmp_path):
+    small(RPO).save(tmp_path / "model.zip")
+    (tmp_path / "model").mkdir()
+    assert RPO.load(tmp_path / "model").env is None
+    with pytest.raises(TypeError, match="env must be a gymnasium environment"):
+        RPO.load(tmp_path / "model", 3)
 
 
 @pytest.mark.parametrize("given", [pendulum, [pendulum]])

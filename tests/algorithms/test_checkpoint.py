@@ -1,10 +1,16 @@
 """A checkpoint is complete: resuming equals not having stopped."""
 
+import base64
 import contextlib
+import io
+import json
+import os
 import pickle
 import tempfile
 import threading
 import warnings
+import zipfile
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -12,12 +18,12 @@ import pytest
 import torch as th
 from conftest import OURS, PHI_0_STEPS, SMALL_ENSEMBLE, SMALL_POLICY, pendulum, small
 from gymnasium.envs.classic_control import PendulumEnv
-from stable_baselines3 import SAC
+from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
-from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_rpto import RPO, RPTO, RTO
@@ -36,9 +42,16 @@ from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.envs.rules import task_rules
 
 
+def states(model):
+    """Of all modules and optimizers."""
+    own = {name: recursive_getattr(model, name).state_dict() for name in model._own_states()}
+    return {**model.get_parameters(), **own}
+
+
 def assert_same(a, b):
-    for name, value in a.get_parameters().items():
-        flat_a, flat_b = _leaves(value), _leaves(b.get_parameters()[name])
+    assert states(a).keys() == states(b).keys()
+    for name, value in states(a).items():
+        flat_a, flat_b = _leaves(value), _leaves(states(b)[name])
         assert len(flat_a) == len(flat_b)
         for x, y in zip(flat_a, flat_b):
             assert x == y if not th.is_tensor(x) else th.equal(x, y), name
@@ -468,15 +481,133 @@ def test_a_new_run_of_a_callbacks_checkpoint_keeps_its_last_step(tmp_path):
         np.testing.assert_array_equal(kept, had)
 
 
-def test_a_sac_that_sb3_loads_has_its_policy(tmp_path):
-    model = small(RPTO)  # the recipe of docs/checkpoints.md
-    sac = SAC("MlpPolicy", pendulum(), policy_kwargs=model.policy_kwargs, device="cpu")
-    parameters = model.get_parameters()
-    sac.set_parameters({name: value for name, value in parameters.items() if not name.startswith("dynamics")})
+#: SLBO's model is no ensemble.
+NETWORK = {SLBO: {"dynamics_kwargs": {"hidden": (16,)}}}
+#: Settings of models whose zips SB3's SAC takes, by algorithm.
+FOR_SAC = [
+    (RPO, {}),
+    (RTO, {}),
+    (RPTO, {"replay_buffer_kwargs": {"target_size": 500}, "train_freq": (1, "episode"), "ent_coef": 0.2}),
+    (RPTO, {"use_sde": True, "action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}),
+    (PTP, {}),
+]
+
+
+@pytest.mark.parametrize(("cls", "given"), FOR_SAC)
+@pytest.mark.parametrize("by", ["load", "to_sac"])
+def test_sb3s_sac_takes_the_zip_predicts_alike_and_learns_on(cls, given, by, tmp_path):
+    model = small(cls, **given).learn(5, source_timesteps=60)
+    model.save(tmp_path / "m")
+    if by == "to_sac":
+        model.to_sac().save(tmp_path / "m")
+    sac = SAC.load(tmp_path / "m", env=pendulum(), device="cpu")
+    assert type(sac) is SAC
+    seen = np.stack([pendulum().reset(seed=i)[0] for i in range(9)])
+    np.testing.assert_array_equal(*(m.predict(seen, deterministic=True)[0] for m in (model, sac)))
+    for name, state in sac.get_parameters().items():
+        for x, y in zip(_leaves(state), _leaves(model.get_parameters()[name]), strict=True):
+            assert x == y if not th.is_tensor(x) else th.equal(x, y), name
+    assert float(sac.ent_coef_tensor if sac.log_ent_coef is None else sac.log_ent_coef.exp()) == pytest.approx(
+        float(model.temperature())
+    )
+    updates = sac._n_updates
+    sac.learning_starts = 0
+    sac.learn(sac.num_timesteps + 250)
+    assert sac._n_updates > updates
+    assert sac.replay_buffer.size() >= 200
+
+
+def test_a_plain_sacs_zip_holds_nothing_of_this_package(tmp_path):
+    model = small(RPTO).learn(5, source_timesteps=60)
+    model.to_sac().save(tmp_path / "plain")
+    with zipfile.ZipFile(tmp_path / "plain.zip") as archive:
+        entries = json.loads(archive.read("data"))
+    pickles = [
+        base64.b64decode(v[":serialized:"]) for v in entries.values() if isinstance(v, dict) and ":serialized:" in v
+    ]
+    assert pickles
+    assert not any(b"sb3_rpto" in text for text in pickles)
+
+
+def test_what_sb3_leaves_alone_in_the_zip_comes_back(tmp_path):
+    given = {"replay_buffer_kwargs": {"target_size": 500}}
+    model = small(RPTO, **given).learn(5, source_timesteps=60)
+    for place in (tmp_path / "m.zip", io.BytesIO()):
+        model.save(place)
+        if not isinstance(place, Path):
+            place.seek(0)
+        loaded = RPTO.load(place, device="cpu")
+        assert loaded.replay_buffer.target.buffer_size == 500
+        assert loaded.replay_buffer_kwargs == model.replay_buffer_kwargs == given["replay_buffer_kwargs"]
+        for name in ("dynamics", "dynamics.optimizer"):
+            for x, y in zip(_leaves(states(loaded)[name]), _leaves(states(model)[name]), strict=True):
+                assert x == y if not th.is_tensor(x) else th.equal(x, y), name
+    with (tmp_path / "written.zip").open("wb") as file:  # which cannot be read
+        model.save(file)
+    assert RPTO.load(tmp_path / "written.zip").dynamics.fitted
+    other = small(RPTO, seed=1)
+    other.set_parameters(tmp_path / "m.zip")
+    assert th.equal(other.dynamics.input_mean, model.dynamics.input_mean)
+
+
+class Runs:
+    """A pickle of it makes a folder when it is read."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.folder),)
+
+
+@pytest.mark.parametrize("ent_coef", ["auto", 0.3])
+def test_a_strangers_weights_are_read_without_running_a_pickle(ent_coef, tmp_path):
+    given = {"policy_kwargs": {"net_arch": [8, 4]}, "gamma": 0.9, "ent_coef": ent_coef, "device": "cpu"}
+    sac = SAC("MlpPolicy", pendulum(), learning_starts=10, seed=0, **given).learn(30)
+    sac.evil = Runs(tmp_path / "ran")
     sac.save(tmp_path / "sac")
+    model = RPO.from_source(tmp_path / "sac.zip", pendulum(), pendulum(12.0), weights_only=True, device="cpu")
+    assert not (tmp_path / "ran").exists()
+    assert (model.gamma, model.policy_kwargs["net_arch"]) == (0.9, [8, 4])
+    assert float(model.temperature()) == pytest.approx(
+        float(sac.log_ent_coef.detach().exp() if ent_coef == "auto" else ent_coef)
+    )
+    for name, value in sac.policy.state_dict().items():
+        assert th.equal(value, model.policy.state_dict()[name]), name
+    assert model.actor.optimizer.state_dict()["state"][0]["step"] == sac._n_updates
+    RPO.from_source(tmp_path / "sac.zip", pendulum(), pendulum(12.0), device="cpu")
+    assert (tmp_path / "ran").exists()  # as one that reads the pickles does
+
+
+def test_what_only_a_pickle_tells_of_a_policy_is_asked_for(tmp_path):
+    kwargs = {"net_arch": [8], "activation_fn": th.nn.Tanh}
+    SAC("MlpPolicy", pendulum(), policy_kwargs=kwargs, device="cpu").save(tmp_path / "sac")
+    worlds = (pendulum(), pendulum(12.0))
+    with pytest.raises(ValueError, match=r"policy_kwargs as a pickle.*pass policy_kwargs="):
+        RPO.from_source(tmp_path / "sac.zip", *worlds, weights_only=True)
+    with pytest.raises(ValueError, match=r"other networks than policy_kwargs=\{'net_arch': \[9\]\}"):
+        RPO.from_source(tmp_path / "sac.zip", *worlds, weights_only=True, policy_kwargs={"net_arch": [9]})
+    model = RPO.from_source(tmp_path / "sac.zip", *worlds, weights_only=True, policy_kwargs=kwargs)
+    assert model.policy_kwargs["activation_fn"] is th.nn.Tanh
+    TD3("MlpPolicy", pendulum(), policy_kwargs={"net_arch": [8]}).save(tmp_path / "td3")
+    with pytest.raises(ValueError, match=r"td3\.zip' is not the zip of a SAC"):
+        RPO.from_source(tmp_path / "td3.zip", *worlds, weights_only=True)
+    with pytest.raises(TypeError, match="must be the path of a zip where weights_only=True, not SAC"):
+        RPO.from_source(SAC("MlpPolicy", pendulum()), *worlds, weights_only=True)
+
+
+def test_a_zip_of_rpto_is_a_source_model_and_slbos_is_not(tmp_path):
+    model = small(RPTO)
+    model.save(tmp_path / "rpto")
+    made = RPO.from_source(tmp_path / "rpto.zip", pendulum(), pendulum(12.0), device="cpu")
     seen = pendulum().reset(seed=0)[0]
-    acts = [m.predict(seen, deterministic=True)[0] for m in (model, SAC.load(tmp_path / "sac", device="cpu"))]
-    np.testing.assert_array_equal(*acts)
+    np.testing.assert_array_equal(*(m.predict(seen, deterministic=True)[0] for m in (model, made)))
+    slbo = small(SLBO, **NETWORK[SLBO])
+    slbo.save(tmp_path / "slbo")
+    with pytest.raises(ValueError, match=r"not the zip of a SAC \(it is an SLBO's, which acts by TRPO's policy"):
+        RPO.from_source(tmp_path / "slbo.zip", pendulum())
+    with pytest.raises(NotImplementedError, match=r"SLBO acts by TRPO's policy.*SLBO\.load"):
+        slbo.to_sac()
 
 
 def test_files_and_arguments_that_load_cannot_take_are_named(tmp_path):
@@ -496,10 +627,6 @@ def test_files_and_arguments_that_load_cannot_take_are_named(tmp_path):
         assert model.replay_buffer is kept
 
 
-#: SLBO's model is no ensemble.
-NETWORK = {SLBO: {"dynamics_kwargs": {"hidden": (16,)}}}
-
-
 @pytest.mark.parametrize("saves", [RPTO, MBPO, PTP, SLBO])
 def test_a_checkpoint_goes_on_with_its_own_class(saves, tmp_path):
     class Mine(saves):
@@ -517,9 +644,9 @@ def test_a_checkpoint_goes_on_with_its_own_class(saves, tmp_path):
 @pytest.mark.parametrize(
     ("cls", "given", "message"),
     [
-        (PTP, {"n_candidates": 0}, "n_candidates must be at least 1"),
+        (PTP, {"n_candidates": 0}, "n_candidates must be a positive integer"),
         (PDML, {"newest_share": 1.0}, "newest_share must lie in"),
-        (SLBO, {"iterations": 0}, "iterations must be at least 1"),
+        (SLBO, {"iterations": 0}, "iterations must be a positive integer"),
         (SLBO, {"rollout_samples": 101}, "is no multiple of rollout_length"),
         (MBPO, {"weighting": "paper"}, r"MBPO does not use \['weighting'\]"),
     ],
@@ -752,7 +879,34 @@ def test_files_are_written_whole_or_not_at_all(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["model.zip"]
 
 
+def test_a_folder_is_no_place_for_a_model(tmp_path):
+    model = small(RPO)
+    with pytest.raises(ValueError, match=r"is a folder; give the name of a file, such as .*model\.zip"):
+        model.save(tmp_path)
+    with pytest.raises(ValueError, match=r"is a folder; give the name of a file, such as .*model\.pkl"):
+        model.save_replay_buffer(str(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+    assert not tmp_path.with_name(f"{tmp_path.name}.zip").exists()
+
+
 # ---------------------------------------------------------------------- warm start
+
+
+@pytest.mark.parametrize(("passed", "steps"), [({"max_steps": 7}, 7), ({}, 40)])
+def test_the_users_max_steps_bound_the_first_fit_too(passed, steps, monkeypatch):
+    monkeypatch.setattr(warm, "PHI_0_UPDATES", 40)
+    fitted = []
+    fit = EnsembleDynamics.fit
+    monkeypatch.setattr(
+        EnsembleDynamics,
+        "fit",
+        lambda self, data, weights=None, max_steps=None: (
+            fitted.append(max_steps or self.max_steps) or fit(self, data, weights, max_steps)
+        ),
+    )
+    model = small(RPTO, dynamics_kwargs={"hidden": (8,), "n_members": 2, "n_elites": 1, **passed}, model_train_freq=5)
+    model.learn(5, source_timesteps=0)
+    assert fitted == [steps, passed.get("max_steps", 300)]  # the default preset's
 
 
 def test_from_source_takes_everything_over(tmp_path):

@@ -367,7 +367,7 @@ def test_bad_input_is_refused_before_learning():
             small(RPO).learn(budget)
     with pytest.raises(ValueError, match="source_timesteps"):
         small(RPO).learn(10, source_timesteps=-1)
-    with pytest.raises(ValueError, match="log_interval is 0"):
+    with pytest.raises(ValueError, match="log_interval must be a number of target episodes from 1"):
         small(RPO).learn(10, log_interval=0)
     with pytest.raises(ValueError, match="4 environments"):
         small(RPO, target=make_vec_env(pendulum, n_envs=4)).learn(3)

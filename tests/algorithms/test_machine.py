@@ -44,7 +44,11 @@ def shifted(length=0.7):
 def model(target, declared="pole.length", env=POLES, **kwargs):
     settings = {"seed": 0, "device": "cpu", "source_steps": 2, "model_train_freq": 40, "batch_size": 16, **kwargs}
     settings = {"dynamics": "physical", "dynamics_kwargs": {"threads": 1}, **settings}
-    settings |= {} if settings["dynamics"] == "ensemble" else {"declared": [declared]}
+    settings |= (
+        {}
+        if settings["dynamics"] == "ensemble"
+        else {"declared": [declared] if isinstance(declared, str) else declared}
+    )
     return RPTO("MlpPolicy", gym.make(env), target_env=target, **settings)
 
 
@@ -242,3 +246,30 @@ def test_a_mark_that_a_task_moves_is_no_other_simulator(held: bool) -> None:
         f"{pushed}</mujoco>"
     )
     assert sites_act(model) == held
+
+
+def heavier_without_inertia(factor=1.3):
+    """A pole whose mass was scaled, and its inertia not."""
+    env = gym.make("InvertedPendulum-v5")
+    robot = env.unwrapped
+    robot.model.body_mass[2] *= factor
+    mujoco.mj_setConst(robot.model, robot.data)
+    return env
+
+
+def test_exact_data_that_a_fit_still_misses_are_told_once():
+    made = model(heavier_without_inertia(), "pole.mass", "InvertedPendulum-v5")
+    with pytest.warns(UserWarning, match=r"sensor noise does not explain it: something differs that was not declared"):
+        made.learn(160, source_timesteps=0)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="after the fit")
+        made.learn(45, reset_num_timesteps=False)
+
+
+def test_exact_data_that_a_fit_meets_are_not_doubted():
+    target = heavier_without_inertia()
+    made = model(target, env="InvertedPendulum-v5", declared=["pole.mass", "pole.inertia"])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="after the fit")
+        made.learn(160, source_timesteps=0)
+    assert made.dynamics.values[0] == pytest.approx(1.3 * 5.01859164, rel=1e-4)

@@ -323,6 +323,31 @@ def test_a_film_shows_three_panels(suffix: str, agent: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("named", ["folder", "zip"])
+def test_a_film_of_an_agent_that_came_from_none_shows_it_alone(named: str, agent: Path, tmp_path: Path) -> None:
+    imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")
+    model = [str(agent)] if named == "folder" else [str(agent / "model.zip"), SOURCE]
+    file = tmp_path / "film.gif"
+    assert cli.main(["enjoy", *model, "--episodes", "1", "--video", str(file), "--seconds", "0.2"]) == 0
+    frames = [frame for frame in imageio.get_reader(file)]  # noqa: C416 (as above)
+    assert frames[0].shape[:2] == (440, 604)
+    assert len(frames) > 5
+
+
+def test_what_a_film_shows_is_known_by_the_runs_folder(
+    agent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[list[str]] = []
+    monkeypatch.setattr(video, "film", lambda panels, *_: shown.append([panel.title for panel in panels]))
+    monkeypatch.setattr(video, "require", lambda path: None)
+    assert transfer(agent, tmp_path / "run", "zero-shot") == 0
+    for folder in (agent, tmp_path / "run"):
+        assert cli.main(["enjoy", str(folder), "--episodes", "1", "--video", "film.gif"]) == 0
+    assert list(map(len, shown)) == [1, 3]
+    assert shown[1][-1] == "transferred policy in the target"
+
+
+@pytest.mark.slow
 def test_a_film_of_mujoco_without_a_display(tmp_path: Path) -> None:
     pytest.importorskip("imageio", reason="the extra 'video' is not installed")
     try:  # MuJoCo alone: what fails of ours must not be skipped
@@ -348,7 +373,7 @@ BAD = {
     "train ContinuousCartPole --out O --set gama=1": "--set gama: there is no such argument; did you mean 'gamma'",
     "train ContinuousCartPole --out O --set gamma": "'gamma' is not NAME=VALUE",
     "train ContinuousCartPole --out O --steps 0": "--steps is 0",
-    "train ContinuousCartPole --out O --device gpu": "--device: 'gpu' cannot be used",
+    "train ContinuousCartPole --out O --device gpu": "--device: device='gpu' cannot be used",
     "train ContinuousCartPole --out O --every -1": "--every is -1",
     "train ContinuousCartPole": "--out",
     "train ContinuousCartPole --out O --set seed=3": "--set seed: there is no such argument",
@@ -358,7 +383,7 @@ BAD = {
     "train ContinuousCartPole --out O --set action_noise=0.1": "--set action_noise: it takes an object of Python",
     "train ContinuousCartPole --out O --steps 100 --set learning_starts=100": "ends before the first update",
     "train Pendulum-v1 --out O --steps 2000": "(learning_starts=10000): nothing would be learned",
-    "train ContinuousCartPole --out O --set learning_starts=abc": "--set learning_starts is 'abc'",
+    "train ContinuousCartPole --out O --set learning_starts=abc": "learning_starts must be an integer and not",
     "train ContinuousCartPole --out O --set optimize_memory_usage=true": "--set optimize_memory_usage",
     "train CartPole-v1 --out O": "action",
     "train FrozenLake-v1 --out O": "observation",
@@ -366,7 +391,7 @@ BAD = {
     "transfer A/model.zip T --out FOREIGN": "holds a model.zip that no run of ours wrote",
     "transfer A/model.zip T --out O --set n_steps=3": "n_steps",
     "transfer absent.zip T --out O": "ZIP: there is no file 'absent.zip'",
-    "transfer A/config.json T --out O": "is not the zip of a SAC",
+    "transfer A/config.json T --out O": "is no zip of a model",
     "transfer A/model.zip T --out O --source-data x.npz": "--source-data: there is no file 'x.npz'",
     "transfer A/model.zip T --out O --method rtpo": "choose one of zero-shot, rpo",
     "transfer A/model.zip rpto/ContinuousCartPole-v0 --out O": "is the source itself",
@@ -396,11 +421,15 @@ BAD = {
     "enjoy A --seconds 0": "--seconds is 0",
     "enjoy A --seconds inf": "--seconds is inf",
     "enjoy A --seed -1": "--seed is -1",
+    "train ContinuousCartPole --out O --set ent_coef=autoo": 'ent_coef must be "auto"',
+    "train ContinuousCartPole --out O --device cuda:9": "device='cuda:9' cannot be used",
+    "transfer A/model.zip T --out O --set learning_starts=-1": "learning_starts must be an integer and not negative",
+    "transfer A/model.zip T --out O --method rpto --set dynamics_kwargs={hidden:[]}": "hidden must be a list of",
     "enjoy BEGUN": "its run is not finished",
     "train ContinuousCartPole --out O --seed -1": "--seed is -1",
     "enjoy A --video f.avi": "a film is .mp4 or .gif",
     "enjoy A --video A/model.zip/f.gif": "nothing can be written into",
-    "enjoy A --video f.gif": "--source-model",
+    "enjoy A --video f.gif --source Pendulum-v1": "pass its zip by --source-model, too",
 }
 
 
@@ -759,7 +788,7 @@ def test_without_the_extras_the_remedy_is_named(
 ) -> None:
     monkeypatch.setattr(video, "find_spec", lambda name: None)
     assert cli.main(["enjoy", str(agent), "--video", "film.mp4", "--source-model", str(agent / "model.zip")]) == 2
-    assert "pip install 'sb3-rpto[video]'" in error(capsys)
+    assert "pip install -e '.[video]'" in error(capsys)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert cli.main(["plot", str(agent), "--out", str(tmp_path / "figure.png")]) == 2
-    assert "pip install 'sb3-rpto[experiments]'" in error(capsys)
+    assert "pip install -e '.[experiments]'" in error(capsys)

@@ -449,7 +449,8 @@ def test_every_row_is_answered_by_one_elite_and_rows_are_dealt_evenly():
     assert set(match.sum(axis=1)[[0, 2, 3]]) <= {1000, 1001}
     # another draw deals differently
     again = model.step(data.observations, data.actions).next_observations
-    assert 0.2 < float((again != prediction.next_observations).any(dim=1).double().mean()) < 0.9
+    other = (again - prediction.next_observations).abs().amax(dim=1) > 1e-4
+    assert 0.2 < float(other.double().mean()) < 0.9
 
 
 def test_a_single_row_gets_a_random_elite():

@@ -31,3 +31,24 @@ def test_directions_are_found(columns, shown, together, held):
     np.testing.assert_allclose(slopes @ directions, 0, atol=1e-6)
     assert np.flatnonzero(entangled(directions)).tolist() == together
     assert np.flatnonzero(to_hold(directions)).tolist() == held
+
+
+def test_who_shares_in_what_is_not_told_does_not_hang_on_the_solver(monkeypatch):
+    """Of several directions every rotation is as good: which one comes out is up to rounding."""
+    columns = [A, 0.03 * A, B, 30 * B, C]
+    slopes = np.stack(columns, axis=1)
+    normal, shown, solve = slopes.T @ slopes, np.ones(5, dtype=bool), np.linalg.eigh
+    shares = []
+    for angle in (0.0, 0.5, 1.0, 1.5):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+        def turned(matrix, turn=turn):
+            values, vectors = solve(matrix)
+            return values, np.concatenate([vectors[:, :2] @ turn, vectors[:, 2:]], axis=1)
+
+        monkeypatch.setattr(np.linalg, "eigh", turned)
+        directions = null_directions(normal, shown)
+        np.testing.assert_allclose(directions.T @ directions, np.eye(2), atol=1e-12)
+        shares.append((entangled(directions).tolist(), to_hold(directions).tolist()))
+    assert shares == [shares[0]] * 4
+    np.testing.assert_allclose(slopes @ directions, 0, atol=1e-6)

@@ -112,7 +112,7 @@ def test_clipped_actions_are_commands():
 @pytest.mark.parametrize("name", ["max_step", "max_steps", "randomise"])
 @pytest.mark.parametrize("value", [-1, float("nan"), float("inf"), "a"])
 def test_settings_out_of_range_are_named(name, value):
-    with pytest.raises(ValueError, match=f"{name} must be a finite number of at least"):
+    with pytest.raises(ValueError, match=f"{name} must be .*, got"):
         dynamics(POLE, **{name: value})
 
 

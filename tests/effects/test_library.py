@@ -226,6 +226,7 @@ ROWS = {
     "sensor_bias": Row("elbow", {"offset": 0.05}, {"offset": 0.0}),
     "sensor_gain": Row("shoulder", {"change": 0.04}, {"change": 0.0}),
     "mass_scale": Row("lower", {"change": -0.25}, {"change": 0.0}),
+    "inertia_scale": Row("lower", {"change": -0.3}, {"change": 0.0}),
     "payload": Row("lower", {"mass": 0.3, "along": 1.6}, {"mass": 0.1, "along": 1.0}),
     "com_offset": Row("base", {"x": 0.03, "y": -0.02, "z": 0.05}, {"x": 0.0, "y": 0.0, "z": 0.0}, model=FLOATING),
     "external_force": Row("base", {"x": 3.0, "y": -2.0, "z": 5.0}, {"x": 0.0, "y": 0.0, "z": 0.0}, model=FLOATING),
@@ -754,6 +755,15 @@ def test_a_lighter_body_is_one_of_another_density() -> None:
     name = ARM.body(2).name
     got = one_step(ARM, [LIBRARY["mass_scale"](name, change=-0.3)])
     np.testing.assert_allclose(got, one_step(edited(ARM, lighter), []), rtol=1e-12)
+
+
+def test_an_inertia_that_did_not_follow_its_mass() -> None:
+    def heavier(m: mujoco.MjModel) -> None:
+        m.body_mass[2] *= 1.3
+
+    name = ARM.body(2).name
+    there = [LIBRARY["mass_scale"](name, change=0.3), LIBRARY["inertia_scale"](name, change=1 / 1.3 - 1)]
+    np.testing.assert_allclose(one_step(ARM, there), one_step(edited(ARM, heavier), []), rtol=1e-12)
 
 
 def test_bounds_and_names_are_checked() -> None:

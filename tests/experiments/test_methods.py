@@ -124,6 +124,7 @@ def test_a_method_learns_on_the_device_that_it_is_given(
     method: str, source_model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
+    monkeypatch.setattr("sb3_rpto.algorithms.settings.check_device", lambda device: None)  # there may be no GPU
     monkeypatch.setattr(base_class, "get_device", lambda device: asked.append(str(device)) or th.device("cpu"))
     settings = {**SMALL.get(method, {}), **({"n_critics": 3} if method == "sac-warm-high" else {})}
     run = Run(source_model, cartpole, target, 20, kwargs=settings, device="cuda")

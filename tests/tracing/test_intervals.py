@@ -6,7 +6,7 @@ from simulated import problem, recorded
 
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.tracing.identify import Linear
-from sb3_rpto.tracing.intervals import half_widths, refit
+from sb3_rpto.tracing.intervals import correlations, half_widths, refit
 from sb3_rpto.tracing.loss import Loss
 from sb3_rpto.tracing.select import Selection, Selector
 
@@ -49,6 +49,18 @@ def test_what_a_single_block_tells_has_no_interval() -> None:
     linear = Linear(x[:, :, None] * x[:, None], gradient, np.arange(2))
     assert np.isnan(half_widths(linear, np.arange(16))).tolist() == [False, True]
     assert np.isnan(half_widths(linear, np.zeros(16))).all()
+
+
+def test_correlations_are_exactly_symmetric_and_one_on_the_diagonal() -> None:
+    x = np.random.default_rng(0).standard_normal((30, 6)) * np.geomspace(1e-3, 1e3, 6)
+    x = np.column_stack([x, x @ np.arange(6), 7 * x[:, 0]])
+    covariance = x.T @ x * (1 + 1e-15 * np.random.default_rng(1).standard_normal((8, 8)))
+    found = correlations(covariance)
+    np.testing.assert_array_equal(np.diag(found), 1)
+    np.testing.assert_array_equal(found, found.T)
+    assert np.abs(found).max() == 1
+    assert found[0, 7] == pytest.approx(1, rel=1e-14)
+    np.testing.assert_allclose(found, x.T @ x / np.outer(*2 * [np.linalg.norm(x, axis=0)]), atol=1e-13)
 
 
 def test_intervals_are_as_wide_as_the_curvature_of_the_loss_says(monkeypatch: pytest.MonkeyPatch) -> None:

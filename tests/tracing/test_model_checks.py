@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.tracing import Measurements
-from sb3_rpto.tracing.model_checks import check_against, doubts
+from sb3_rpto.tracing.model_checks import _correlate, _Force, check_against, doubts
 
 ARM = """<mujoco>
   <option timestep="0.002" integrator="implicitfast"/>
@@ -279,3 +279,11 @@ def test_commands_that_the_model_clips():
     told["ctrl.first"] = 4.0 * told["ctrl.first"]  # N·m in place of shares
     with pytest.raises(ValueError, match=r"'ctrl.first': \d\d% of the samples.*gear times ctrl"):
         check_against(model, Measurements.from_tables({"run": told}))
+
+
+@pytest.mark.parametrize("still", ["needed", "given"])
+def test_a_force_that_is_constant_but_for_rounding_agrees_with_nothing(still):
+    forces = {"needed": np.sin(np.arange(600) / 9), "given": np.cos(np.arange(600) / 9)}
+    forces[still] = 0.1 * (1 + 1e-15 * forces[still])
+    assert np.std(forces[still]) > 0
+    assert _correlate([_Force("run", "elbow", **forces, clear=np.ones(600, dtype=bool))]) is None

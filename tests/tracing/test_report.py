@@ -1,7 +1,9 @@
 """The report: its text, its JSON, and the corrected model that it saves."""
 
 import copy
+import errno
 import json
+import os
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -115,6 +117,31 @@ def test_json_writes_null_for_what_is_not_finite(report: Report) -> None:
     assert found["learnable"] == {"hinge": None}
     assert found["force_after"] == {"hinge": None}
     assert found["threshold"] is None
+
+
+def test_a_report_that_fails_half_way_leaves_all_files_of_the_earlier_one(
+    report: Report, tmp_path, monkeypatch
+) -> None:
+    report.save(tmp_path)
+    (tmp_path / "notes.txt").write_text("mine")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert set(before) == {"model.xml", "effects.json", "report.json", "report.html", "notes.txt"}
+    later = replace(report, verdict="unexplained", declared=[])
+    synced: list[int] = []
+
+    def full(file: int) -> None:
+        synced.append(file)
+        if len(synced) == 4:  # the last of the files
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        later.save(tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    monkeypatch.undo()
+    later.save(tmp_path)
+    after = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert [name for name in before if before[name] == after[name]] == ["notes.txt"]
 
 
 def test_saved_model_simulates_as_the_corrected_one(report: Report, planted, tmp_path: Path) -> None:

@@ -98,6 +98,19 @@ def test_coulomb_and_stribeck_friction_are_alike_and_so_are_lag_and_delay() -> N
     assert np.all((found.cosine >= 0) & (found.cosine <= 1))
 
 
+def test_of_what_is_alike_up_to_rounding_none_is_the_likest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a last digit would decide which of several that act alike is tried first."""
+    p = problem([CoulombFriction("hinge"), ViscousFriction("hinge"), TorqueOffset("hinge")], recorded())
+    reduce, solve, found = p.reduce, np.linalg.svd, []
+    ones = np.tile(np.ones((3, 3)), (len(p.windows), 1, 1))
+    monkeypatch.setattr(p, "reduce", lambda *args: replace(reduce(*args), normal=ones))
+    for seed in range(4):
+        digits = iter(1 + 1e-15 * np.random.default_rng(seed).standard_normal(3))
+        monkeypatch.setattr(np.linalg, "svd", lambda *a, digits=digits, **k: solve(*a, **k) * next(digits))
+        found.append(screen(p, at_null(p)).cosine)
+    np.testing.assert_array_equal(found, np.ones((4, 3, 3)))
+
+
 def test_what_is_not_excited_is_alike_to_nothing() -> None:
     cosine = np.array([[1, 0.99, 1], [0.99, 1, 0.5], [1, 0.5, 1]])
     found = Screening(np.array([9.0, 9.0, 1.0]), cosine, [None] * 3)

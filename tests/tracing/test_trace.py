@@ -527,7 +527,7 @@ def test_a_calibrated_threshold_is_the_one_that_selects(
 @pytest.mark.parametrize("name", ["seed", "calibrate", "threads"])
 @pytest.mark.parametrize("wrong", [1.5, True, -1])
 def test_what_is_no_whole_number_is_refused(name: str, wrong: Any) -> None:
-    with pytest.raises(ValueError, match=f"{name} is .*; give a whole number from 0"):
+    with pytest.raises(ValueError, match=f"{name} must be .*, got"):
         trace(COARSE, simple(), **{name: wrong})
 
 

@@ -218,7 +218,7 @@ def test_a_ball_joint_of_other_damping_is_named_and_no_mass() -> None:
     assert report.verdict in ("unexplained", "partly explained")
     kinds = [f.kind for f in report.findings]
     assert "beyond the library" in kinds
-    assert not {"undeclared mass", "exchanged", "reversed", "early response"} & {*kinds}
+    assert not {"undeclared mass", "undeclared inertia", "exchanged", "reversed", "early response"} & {*kinds}
     (said,) = [f.message for f in report.findings if f.kind == "beyond the library"]
     assert "ball joint 'sh'" in said
 
@@ -232,4 +232,6 @@ def test_a_pole_that_a_mocap_body_holds_in_the_model_alone_is_unexplained_by_tha
     assert report.verdict == "unexplained"
     kinds = [f.kind for f in report.findings]
     assert {"mocap body", "beyond the library"} <= {*kinds}
-    assert not {"soft tie", "large angle", "undeclared mass", "reversed", "early response"} & {*kinds}
+    assert not {"soft tie", "large angle", "undeclared mass", "undeclared inertia", "reversed", "early response"} & {
+        *kinds
+    }

@@ -148,6 +148,7 @@ def simulate(
     rate: float = 250.0,
     noise: float = 1e-3,
     velocity: bool = True,
+    step: float = STEP,
 ) -> Measurements:
     """Recordings of a machine whose declared parameters are off by up to 15 % and that has effects in it.
 
@@ -160,15 +161,16 @@ def simulate(
     :param gentle: whether it hardly moves
     :param episodes: how many
     :param duration: of an episode in s
-    :param rate: of the samples in Hz; its interval must be a multiple of :data:`STEP`
+    :param rate: of the samples in Hz; its interval must be a multiple of ``step``
     :param noise: standard deviation of the position noise in rad or m
     :param velocity: whether the velocity is recorded
+    :param step: of the integration in s
     """
-    substeps, samples = round(1 / rate / STEP), round(duration * rate)
-    if abs(substeps * STEP * rate - 1) > 1e-9:
-        raise ValueError(f"rate is {rate:g} Hz; its interval must be a multiple of {STEP:g} s")
+    substeps, samples = round(1 / rate / step), round(duration * rate)
+    if abs(substeps * step * rate - 1) > 1e-9:
+        raise ValueError(f"rate is {rate:g} Hz; its interval must be a multiple of {step:g} s")
     _, model = load_model(machine.source())
-    model.opt.timestep = STEP
+    model.opt.timestep = step
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)]
     known = declare(model, declared_beside(machine, effects))
     factors = streams[0].uniform(1 - SPREAD, 1 + SPREAD, len(known))
@@ -202,7 +204,7 @@ def simulate(
     for k in range(samples):
         q, v = (a.copy() for a in past[-1])
         for effect, x in sensors:
-            steps = effect.late(x) / STEP
+            steps = effect.late(x) / step
             if steps.any():
                 recent = past[-1 - math.ceil(steps.max()) :]
                 positions = np.stack([q_then[:, effect.adr] for q_then, _ in recent], axis=1)
@@ -218,7 +220,7 @@ def simulate(
         for substep in range(substeps):
             world.ctrl[:] = commands[:, k]
             for effect, x, memory in chain:
-                world.ctrl[:, effect.ctrl] = effect.command(world.ctrl[:, effect.ctrl].copy(), x, memory, STEP)
+                world.ctrl[:, effect.ctrl] = effect.command(world.ctrl[:, effect.ctrl].copy(), x, memory, step)
             push(begins=substep == 0)
             world.batch.step()
             past.append((world.qpos.copy(), world.qvel.copy()))
