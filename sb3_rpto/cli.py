@@ -152,7 +152,7 @@ def _trace(parsed: argparse.Namespace) -> int:
     model = _model(parsed.model)
     recordings.check_out(parsed.out, model)
     known = recordings.known(parsed.known, model)
-    data = recordings.read(parsed.files, parsed.format)
+    data = recordings.read(parsed.files, parsed.format, parsed.rename)
     with _folder(parsed.out), _progress(parsed.quiet) as progress:
         report = trace(
             model,

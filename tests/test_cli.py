@@ -93,6 +93,26 @@ def test_options_reach_the_trace(files: Path, monkeypatch: pytest.MonkeyPatch) -
     assert {name: asked[name] for name in expected} == expected
 
 
+def test_columns_that_files_call_otherwise_are_renamed(
+    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    header, rows = (files / "runs.csv").read_text().split("\n", 1)
+    (files / "own.csv").write_text(f"# {header.replace('time', 't').replace('qpos.hinge', 'q1')}\n{rows}")
+    read: list[Measurements] = []
+    monkeypatch.setattr("sb3_rpto.tracing.trace", lambda model, data, *_, **__: read.append(data) or sys.exit(7))
+    with pytest.raises(SystemExit):
+        run(files, "--rename", "t=time", "--rename", "q1=qpos.hinge", data="own.csv")
+    assert recordings.digest(read[0]) == recordings.digest(Measurements.from_csv(files / "runs.csv"))
+    capsys.readouterr()
+    for given, said in (
+        ("t=time", "unknown column 'q1'"),
+        ("t=time,q2=qpos.hinge", "rename: there is no column 'q2'; did you mean 'q1'"),
+        ("t=tme", "argument --rename: 't=tme' is not OLD=NEW"),
+    ):
+        assert run(files, "--rename", given, data="own.csv") == 2
+        assert said in error(capsys)
+
+
 def test_a_file_is_no_folder_to_write_to(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (files / "report").write_text("mine")
     assert run(files, "--out", str(files / "report")) == 2

@@ -40,7 +40,7 @@ ROUNDING = 1e-6
 #: And, where the last one did not account for everything, when there are so many times as many transitions.
 MORE = 2
 #: Findings that say what would account for the target in place of effects.
-OTHERWISE = {"time step", "early response", "exchanged", "reversed"}
+OTHERWISE = {"beyond the library", "time step", "early response", "exchanged", "reversed"}
 #: Samples in a window: several steps show what acts late, and contacts do not amplify errors yet.
 WINDOW = 4
 #: What is missing grows with the square of the time, noise does not: where there is some and no contacts come and go,

@@ -86,7 +86,7 @@ def run(parsed: argparse.Namespace) -> int:
                 "--known and --set dynamics_kwargs both give effects; give them all in the file of --known"
             )
         settings["dynamics_kwargs"] = {**own, "effects": effects}
-    data = replace(recordings.read(parsed.files, parsed.format), simulated=parsed.simulated)
+    data = replace(recordings.read(parsed.files, parsed.format, parsed.rename), simulated=parsed.simulated)
     config = {
         "command": "adapt",
         "env": world.name,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,14 @@ def add(parser: argparse.ArgumentParser) -> None:
     """Add what is told of recordings, and of what to look for in them, to a command's parser."""
     parser.add_argument("files", metavar="FILES", nargs="+", help="recordings: .csv, .csv.gz, .parquet or .npz")
     parser.add_argument("--format", choices=sorted(FORMATS), help="of the recordings (default: by their suffix)")
+    parser.add_argument(
+        "--rename",
+        metavar="OLD=NEW,...",
+        type=_rename,
+        action="append",
+        default=[],
+        help="columns that the files call otherwise: t=time,q1=qpos.shoulder,cmd1=ctrl.m1; repeatable",
+    )
     parser.add_argument(
         "--declare",
         metavar="A,B",
@@ -45,6 +53,15 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="the recordings are of the simulator itself, in its own steps in time (default: found out; being told "
         "saves a second search)",
     )
+
+
+def _rename(text: str) -> dict[str, str]:
+    from sb3_rpto.tracing.tables import parse_rename
+
+    try:
+        return parse_rename(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def names(text: str) -> list[str]:
@@ -95,19 +112,23 @@ def known(path: Path | None, model: ModelSource) -> list[Effect]:
     return [] if path is None else read_effects(path, load_model(model)[1])
 
 
-def read(files: Sequence[str], form: str | None) -> Measurements:
+def read(files: Sequence[str], form: str | None, rename: Sequence[Mapping[str, str]] = ()) -> Measurements:
     """Read files of one format.
 
     :param files: paths or patterns
     :param form: the format; None: by their suffix
-    :raises ValueError: of several formats, or an unknown one
+    :param rename: names of columns by those of the files
+    :raises ValueError: of several formats, or an unknown one; a name that the files do not have, or that is given twice
     """
     from sb3_rpto.tracing import Measurements
 
     found = {form} if form else {_format_of(file) for file in files}
     if len(found) > 1:
         raise ValueError(f"FILES are of several formats ({', '.join(sorted(map(str, found)))}); convert them to one")
-    return getattr(Measurements, FORMATS[str(found.pop())])(files)
+    pairs = [pair for each in rename for pair in each.items()]
+    if len({old for old, _ in pairs}) < len(pairs):
+        raise ValueError("--rename names a column twice; name each once")
+    return getattr(Measurements, FORMATS[str(found.pop())])(files, rename=dict(pairs) or None)
 
 
 def digest(data: Measurements) -> str:

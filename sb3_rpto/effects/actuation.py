@@ -47,6 +47,15 @@ def memoryless(model: mujoco.MjModel, actuator: int) -> bool:
     )
 
 
+def on_voltage(model: mujoco.MjModel, actuator: int) -> bool:
+    r"""Whether an actuator is a ``dcmotor`` of a voltage and without a state: its torque is :math:`K (u - K w) / R`."""
+    return bool(
+        model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_DCMOTOR
+        and model.actuator_ctrlspec[actuator] == mujoco.mjtCtrlInput.mjINPUT_VOLTAGE
+        and not model.actuator_actnum[actuator]
+    )
+
+
 def drivers(model: mujoco.MjModel, joint: int) -> list[int]:
     """The actuators that act on a joint itself, not through a tendon or a site."""
     actuators = range(model.nactuator)

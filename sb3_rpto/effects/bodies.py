@@ -367,14 +367,14 @@ class ContactSoftness(Effect):
         names = object_names(model, "geom")
         still = (model.body_weldid[model.geom_bodyid] == 0) & (model.geom_solref[:, 0] > 0)
         geoms = [g for g in range(model.ngeom) if still[g]]
-        return [names[g] for g in geoms if any(_may_touch(model, g, h) for h in range(model.ngeom))]
+        return [names[g] for g in geoms if any(may_touch(model, g, h) for h in range(model.ngeom))]
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Scale the geom's numbers."""
         world.field("geom_solref")[:, self.index] *= 1 + x
 
 
-def _may_touch(model: mujoco.MjModel, g: int, h: int) -> bool:
+def may_touch(model: mujoco.MjModel, g: int, h: int) -> bool:
     """Whether two geoms collide, by the model's flags and their bits, and their bodies can move against each other."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
         return False
@@ -387,4 +387,4 @@ def _may_touch(model: mujoco.MjModel, g: int, h: int) -> bool:
 
 def _may_slip(model: mujoco.MjModel, g: int, h: int) -> bool:
     """Whether they do, and friction is felt."""
-    return _may_touch(model, g, h) and max(model.geom_condim[g], model.geom_condim[h]) > 1
+    return may_touch(model, g, h) and max(model.geom_condim[g], model.geom_condim[h]) > 1

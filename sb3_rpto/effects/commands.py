@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.actuation import GAINS, servo_of
+from sb3_rpto.effects.actuation import GAINS, on_voltage, servo_of
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.names import object_id, object_names
 from sb3_rpto.effects.world import World
@@ -122,7 +122,11 @@ class CommandDeadband(Effect):
 
 @register
 class CommandGain(Effect):
-    r"""A wrong gain of the amplifier: :math:`(1 + g)\,u`, after the controller's own limits; MuJoCo's ``gainprm``."""
+    r"""A wrong gain of the amplifier: :math:`(1 + g)\,u`, after the controller's own limits; MuJoCo's ``gainprm``.
+
+    Of a ``dcmotor`` it is one on the voltage alone: its back-EMF stays, with the motor constant :math:`K / (1 + g)` and
+    the resistance :math:`R / (1 + g)^2`.
+    """
 
     kind = "command_gain"
     place = "actuator"
@@ -134,13 +138,18 @@ class CommandGain(Effect):
 
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
-        """Actuators whose force is linear in their gain parameters."""
-        gains = dict(zip(object_names(model, "actuator"), model.actuator_gaintype))
-        return [name for name in super().places(model) if gains[name] in GAINS]
+        """Actuators whose force is linear in their gain parameters, and motors of a voltage."""
+        ids = {name: i for i, name in enumerate(object_names(model, "actuator"))}
+        every = super().places(model)
+        return [n for n in every if model.actuator_gaintype[ids[n]] in GAINS or on_voltage(model, ids[n])]
 
     def write(self, world: World, x: np.ndarray) -> None:
         """Scale the gain."""
-        world.field("actuator_gainprm")[:, self.index, :3] *= 1 + x
+        gain = world.field("actuator_gainprm")[:, self.index]
+        if on_voltage(world.model, self.index):
+            gain[:, :2] /= (1 + x) ** [2, 1]  # resistance, motor constant
+        else:
+            gain[:, :3] *= 1 + x
 
 
 @register

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 import mujoco
@@ -228,15 +228,15 @@ def declare(model: mujoco.MjModel, names: Iterable[str]) -> list[Declared]:
     if isinstance(names, Mapping) or not all(isinstance(entry, str) for entry in entries):
         raise TypeError(f"declared must be a list of names, not {names!r}; bounds are part of one: 'arm.mass=0.2:0.9'")
     found: dict[tuple[str, int, str], Declared] = {}
+    # What has none of these marks is a name as it stands.
+    known = parameter_names(model) if any(c in entry for entry in entries for c in "=*?[") else []
     for entry in entries:
-        name, equals, given = entry.partition("=")
-        bounds = _bounds(entry, given) if equals else None
+        name, bounds = _parted(entry, known)
         matches = [name]
-        if any(c in name for c in "*?[") and name not in parameter_names(model):  # names may have brackets
-            matches = fnmatch.filter(parameter_names(model), name)
-            matches = [m for m in matches if _scalable(model, m)]
+        if _is_pattern(name, known):
+            matches = [m for m in fnmatch.filter(known, name) if _scalable(model, m)]
             if not matches:
-                raise ValueError(f"declared {name!r} matches nothing; {near(name, parameter_names(model))}")
+                raise ValueError(f"declared {name!r} matches nothing; {near(name, known)}")
         for match in matches:
             one = Declared(model, match, bounds)
             least, bounded = one.parameters[0].lower, bounds is not None and one.owner != "actuator"
@@ -257,9 +257,26 @@ def _scalable(model: mujoco.MjModel, name: str) -> bool:
     return found.owner != "actuator" or found.nominal != 0
 
 
-def _bounds(entry: str, given: str) -> tuple[float, float]:
+def _is_pattern(name: str, known: Collection[str]) -> bool:
+    """Whether a name has wildcards; those of objects may have brackets themselves."""
+    return any(c in name for c in "*?[") and not _is_known(name, known)
+
+
+def _is_known(name: str, known: Collection[str]) -> bool:
+    """Whether a name is of one number, be it with its object's kind before it."""
+    kind, _, rest = name.partition(":")
+    return name in known or (kind in OBJECTS and rest in known)
+
+
+def _parted(entry: str, known: Collection[str]) -> tuple[str, tuple[float, float] | None]:
+    """A name, and the bounds behind the last ``=`` that is no part of it."""
+    name, equals, given = entry.rpartition("=")
+    if not equals or _is_known(entry, known) or fnmatch.filter(known, entry):
+        return entry, None
     try:
         lower, upper = (float(part) for part in given.split(":"))
+        return name, (lower, upper)
     except ValueError:
-        raise ValueError(f"declared {entry!r}: write bounds as <name>=<lower>:<upper>") from None
-    return lower, upper
+        if _is_known(name, known) or fnmatch.filter(known, name):
+            raise ValueError(f"declared {entry!r}: write bounds as <name>=<lower>:<upper>") from None
+        return entry, None

@@ -13,13 +13,14 @@ from sb3_rpto.effects.actuation import servo_of
 from sb3_rpto.effects.units import joint_of
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import BEYOND, TOLERANCE, Adequacy
-from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.checks import Finding, listed
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor, observed, predictions
 from sb3_rpto.tracing.identify import START_STEPS, Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.misread import CLEARLY
 from sb3_rpto.tracing.prepare import SHORTER, SetUp
 from sb3_rpto.tracing.select import Selector
+from sb3_rpto.tracing.unreached import Hint
 from sb3_rpto.tracing.windows import cut, noise_levels
 
 JOINT, SLIDE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -76,7 +77,7 @@ def missed(
         "that it was fitted to: a test run differs (a moved sensor, another load), or moves as none of those did; the "
         "verdict is about those"
     )
-    return [Finding("missed", ", ".join(runs), message)]
+    return [Finding("missed", listed(runs), message, tuple(runs))]
 
 
 def _from_fitted_starts(
@@ -139,19 +140,20 @@ def strays(selector: Selector, values: np.ndarray, set_up: SetUp, after: Adequac
     runs = np.array([data.episodes[i].run for problem, data in parts for i in problem.windows.episode])
     stray = errors > limit
     whole = [run for run in sorted({*runs[stray]}) if stray[runs == run].mean() > 0.5]
-    groups = [(f"run {run}", runs == run) for run in whole] + [("fitted runs", ~np.isin(runs, whole))]
+    groups = [(run, runs == run) for run in whole] + [("", ~np.isin(runs, whole))]
     times = np.concatenate([problem.windows.time for problem, _ in parts])
     found = []
-    for where, rows in groups:
+    for run, rows in groups:
         if stray[rows].any():
             worst = int(np.flatnonzero(rows)[errors[rows].argmax()])
             message = (
                 f"{stray[rows].sum()} of {rows.sum()} windows err far more than the others, most the one at "
-                f"{times[worst]:.3g} s of {runs[worst]}; fits give them little weight (robust loss)"
+                f"{times[worst]:.3g} s{'' if run else f' of {runs[worst]}'}; fits give them little weight (robust loss)"
             )
             if after.denied_by_strays:
                 message += "; such windows alone deny that the model accounts for the data: see what happens there"
-            found.append(Finding("stray windows", where, message))
+            kind, where = "stray windows", "fitted runs"
+            found.append(Finding.of_run(kind, run, "", message) if run else Finding(kind, where, message))
     return found
 
 
@@ -237,7 +239,9 @@ def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> 
         'solreffriction="0.001 1" there, and solimpfriction="0.99 0.99", as that of machines holds; or name '
         "soft_friction among the candidates, or among the known effects"
     )
-    return [Finding("soft friction", ", ".join(e.label for e in firm), message)]
+    model = problem.simulation.model
+    bodies = frozenset(int(model.dof_bodyid[e.dof]) for e in firm)
+    return [Hint("soft friction", ", ".join(e.label for e in firm), message, bodies=bodies, left=share)]
 
 
 def own_steps(

@@ -91,8 +91,9 @@ def read_columns(names: Iterable[str], file: str) -> Columns:
             unknown.append(name)
     if unknown:
         also = f" (unknown, too: {', '.join(map(repr, unknown[1:]))})" if unknown[1:] else ""
-        if unknown[0].startswith("#"):
-            raise ValueError(f"{file}: the first line is {unknown[0]!r}, a comment; remove the lines above the header")
+        bare = unknown[0].lstrip("#% ")
+        if bare != unknown[0] and (bare in PLAIN or bare.partition(".")[0] in PREFIXES):
+            raise ValueError(f"{file}: column {unknown[0]!r} begins with a mark of comments; call it {bare!r}")
         raise ValueError(
             f"{file}: unknown column {unknown[0]!r}; {_near(unknown[0])}; rename it, or drop what is not needed{also}"
         )

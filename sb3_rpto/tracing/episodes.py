@@ -216,13 +216,13 @@ def repair(run: Episode, columns: Columns, findings: list[Finding]) -> list[Epis
         message = (
             f"{len(slices) - 1} gap(s) in time, the longest {longest:.4g} s; split there into {len(slices)} episodes"
         )
-        findings.append(Finding("gap", run.name, message))
+        findings.append(Finding.of_run("gap", run.name, "", message))
     pieces = []
     for i, rows in enumerate(slices):
         name = run.name if len(slices) == 1 else f"{run.name}/{i}"
         if rows.stop - rows.start < checks.MIN_ROWS:
             message = f"{rows.stop - rows.start} row(s) between gaps are too few to use; set aside"
-            findings.append(Finding("short", name, message))
+            findings.append(Finding.of_run("short", name, "", message))
             continue
         pieces.append(replace(run.part_of(rows, after_gap=i > 0), name=name))
         _channels(pieces[-1], columns, findings)
@@ -246,7 +246,7 @@ class _Tell:
         self._name, self._findings = episode.name, findings
 
     def __call__(self, kind: str, message: str, column: str = "time") -> None:
-        self._findings.append(Finding(kind, f"{self._name}, {column}", message))
+        self._findings.append(Finding.of_run(kind, self._name, column, message))
 
     def slope(self, slope: float | None, column: str) -> None:
         """Of measured velocities against the positions' change, where it is not about 1."""

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from sb3_rpto.effects import Declared
 from sb3_rpto.effects.carry import carried_by
 from sb3_rpto.tracing import causes, figures, wording
-from sb3_rpto.tracing.checks import grouped
 from sb3_rpto.tracing.figures import Picture, horizon_label
 from sb3_rpto.version import __version__
 
@@ -252,7 +251,7 @@ def _candidates(report: Report) -> str:
 def _findings(report: Report) -> str:
     if not report.findings:
         return _note("Nothing was repaired or set aside.")
-    return _table(["what", "where", "what was done"], [[f.kind, f.where, f.message] for f in grouped(report.findings)])
+    return _table(["what", "where", "what was done"], [[f.kind, f.where, f.message] for f in report.findings])
 
 
 def _data(report: Report) -> str:

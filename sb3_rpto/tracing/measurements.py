@@ -1,12 +1,9 @@
 """Recorded episodes of a machine, read from files and checked before anything is fitted to them."""
 
-import csv
 import glob
-import gzip
 import os
 import warnings
 import zipfile
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +15,7 @@ from sb3_rpto.tracing import checks
 from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.columns import Columns, joint_of, read_columns
 from sb3_rpto.tracing.episodes import PARTS, Episode, Table, check_clocks, read_run, repair, runs_of
+from sb3_rpto.tracing.tables import read_text, renamed
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -99,22 +97,28 @@ class Measurements:
         return "\n".join([repr(self), *(f"  {finding}" for finding in checks.grouped(self.findings))])
 
     @classmethod
-    def from_csv(cls, paths: Paths) -> "Measurements":
+    def from_csv(cls, paths: Paths, rename: Mapping[str, str] | None = None) -> "Measurements":
         """Read CSV files, also gzipped (``.csv.gz``); a file without an ``episode`` column is one episode.
 
+        Read are headers behind a ``#`` or ``%`` (``np.savetxt``), rows of SI units below them, semicolons, tabs or
+        blanks between columns, decimal commas, marks at the ends of lines, and quoted names.
+
         :param paths: a path, a glob pattern, or several of them; a header and one row a sample, in SI units
+        :param rename: the format's names by those of the files, such as ``{"t": "time", "q1": "qpos.shoulder"}``
         :raises FileNotFoundError: nothing matches
-        :raises TypeError: a table in memory
+        :raises TypeError: a table in memory, or names that are no mapping
         :raises ValueError: an empty file, a row of another length than the header, a broken gzip file, other text than
-            UTF-8, or data that break the file format (see :meth:`from_tables`)
+            UTF-8, units of others, a name in ``rename`` that a file does not have, or data that break the file format
+            (see :meth:`from_tables`)
         """
-        return cls.from_tables({path: _read_csv(path) for path in _expand(paths)})
+        return cls.from_tables({path: read_text(path, rename) for path in _expand(paths)})
 
     @classmethod
-    def from_parquet(cls, paths: Paths) -> "Measurements":
+    def from_parquet(cls, paths: Paths, rename: Mapping[str, str] | None = None) -> "Measurements":
         """Read Parquet files, as :meth:`from_csv` does.
 
         :param paths: as there
+        :param rename: as there
         :raises FileNotFoundError: nothing matches
         :raises ImportError: pandas is not installed; pandas itself asks for pyarrow
         :raises ValueError: no Parquet file, or data that break the file format (see :meth:`from_tables`)
@@ -133,14 +137,16 @@ class Measurements:
             index = [name for name in frame.index.names if name is not None and name not in frame.columns]
             if index:  # pandas puts what was its index back there
                 frame = frame.reset_index(index)
-            tables[path] = {name: frame[name].to_numpy() for name in frame.columns}
+            names = renamed([*frame.columns], rename, path)
+            tables[path] = {new: frame[name].to_numpy() for name, new in zip(frame.columns, names)}
         return cls.from_tables(tables)
 
     @classmethod
-    def from_npz(cls, paths: Paths) -> "Measurements":
+    def from_npz(cls, paths: Paths, rename: Mapping[str, str] | None = None) -> "Measurements":
         """Read npz archives with one array of shape (T,) for each column, as :meth:`from_csv` does.
 
         :param paths: as there
+        :param rename: as there
         :raises FileNotFoundError: nothing matches
         :raises ValueError: no whole archive of named arrays, arrays of Python objects, or data that break the file
             format (see :meth:`from_tables`)
@@ -155,6 +161,8 @@ class Measurements:
             except ValueError as error:
                 message = f"{path}: no npz archive, or it holds arrays of Python objects; write plain numbers and text"
                 raise ValueError(message) from error
+            names = renamed([*tables[path]], rename, path)
+            tables[path] = dict(zip(names, tables[path].values()))
         return cls.from_tables(tables)
 
     @classmethod
@@ -199,8 +207,8 @@ class Measurements:
                 )
                 content += (run.time - run.time[0]).round(9).tobytes()
                 if content in seen:
-                    message = f"the same samples as episode {seen[content]}; only that one is kept"
-                    findings.append(Finding("duplicate", name, message))
+                    message = f"the same samples as episode {seen[content]!r}; only that one is kept"
+                    findings.append(Finding.of_run("duplicate", name, "", message))
                     continue
                 seen[content] = name
                 episodes += repair(run, columns, findings)
@@ -362,34 +370,6 @@ def _drawn(lengths: dict[str, int], apart: int, seed: int) -> list[str]:
         if sum(lengths[r] for r in order[apart:]) >= due / 2:
             return order
     return sorted(runs, key=lambda r: lengths[r])
-
-
-def _read_csv(path: str) -> dict[str, np.ndarray]:
-    """Columns as strings: numpy turns them into the nearest floats, which some faster parsers do not."""
-    opener = gzip.open if path.endswith(".gz") else open
-    try:
-        with opener(path, "rt", newline="", encoding="utf-8-sig") as stream:
-            rows = [row for row in csv.reader(stream) if row]
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise ValueError(f"{path}: no whole gzip file ({error}); write it again") from error
-    except csv.Error as error:
-        raise ValueError(
-            f"{path}: no CSV ({error}); is a quote left open, or its end torn? Correct that row"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: no text in UTF-8 ({error}); save the table as CSV in UTF-8") from error
-    if not rows:
-        raise ValueError(f"{path}: the file is empty; give a header and one row a sample")
-    header = [name.strip() for name in rows.pop(0)]
-    other = next((mark for mark in ";\t" if mark in header[0]), None)
-    if other is not None:
-        raise ValueError(f"{path}: the columns are separated by {other!r}; separate them by commas, decimals by points")
-    read_columns(header, path)
-    for number, row in enumerate(rows):
-        if len(row) != len(header):
-            raise ValueError(f"{path}: row {number} has {len(row)} fields, the header {len(header)}; correct that row")
-    cells = np.array([[cell or "nan" for cell in row] for row in rows], dtype=str).reshape(-1, len(header))
-    return dict(zip(header, cells.T))
 
 
 def _expand(paths: Paths) -> list[str]:

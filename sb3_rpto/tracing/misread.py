@@ -11,13 +11,13 @@ import numpy as np
 
 from sb3_rpto.effects.actuation import drivers
 from sb3_rpto.effects.names import SCALAR_JOINTS, object_names
-from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.columns import Columns, joint_of
 from sb3_rpto.tracing.episodes import Episode
 from sb3_rpto.tracing.identify import START_STEPS, Problem
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.prepare import SetUp
 from sb3_rpto.tracing.search import Found
+from sb3_rpto.tracing.unreached import Hint
 from sb3_rpto.tracing.windows import cut
 
 #: Another way of reading that leaves less than this share of the error is told.
@@ -36,6 +36,7 @@ class Reading:
     :param remedy: what to do if it is right
     :param again: an episode read so
     :param order: of the position columns' noise then
+    :param joints: that it concerns; none: all
     """
 
     kind: str
@@ -44,6 +45,7 @@ class Reading:
     remedy: str
     again: Callable[[Episode], Episode]
     order: Sequence[int]
+    joints: tuple[str, ...] = ()
 
 
 def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
@@ -70,13 +72,13 @@ def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
             speeds = _exchanged(len(columns.qvel), columns.qvel.index(one), columns.qvel.index(other))
             where, what = f"qpos.{one}, qpos.{other}", f"with the positions of {one} and {other} exchanged"
             again = _reordered(order, speeds)
-            yield Reading("exchanged", where, what, "exchange them", again, order)
+            yield Reading("exchanged", where, what, "exchange them", again, order, (one, other))
             if len(motors[i]) == len(motors[j]) == 1:
                 (k,), (m,) = motors[i], motors[j]
                 where += f", ctrl.{columns.ctrl[k]}, ctrl.{columns.ctrl[m]}"
                 what = f"with {one} and {other} exchanged, positions and commands"
                 both = _in_turn(again, _told(_exchanged(len(columns.ctrl), k, m)))
-                yield Reading("exchanged", where, what, "exchange them", both, order)
+                yield Reading("exchanged", where, what, "exchange them", both, order, (one, other))
     for i, j in combinations(range(len(columns.ctrl)), 2):
         one, other = columns.ctrl[i], columns.ctrl[j]
         where, what = f"ctrl.{one}, ctrl.{other}", f"with the commands of {one} and {other} exchanged"
@@ -85,16 +87,16 @@ def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
     for i in scalar:
         name, speed = columns.qpos[i], columns.qvel.index(columns.qpos[i])
         what, remedy = f"with the sign of {name} reversed", "let the column count as the model's axis does"
-        yield Reading("reversed", f"qpos.{name}", what, remedy, _reversed(i, speed, []), positions)
+        yield Reading("reversed", f"qpos.{name}", what, remedy, _reversed(i, speed, []), positions, (name,))
         if motors[i]:  # the machine's axis may be the other way round, for its commands as well
             commands = [columns.ctrl[k] for k in motors[i]]
             where = ", ".join([f"qpos.{name}", *(f"ctrl.{command}" for command in commands)])
             what = f"with the signs of {' and '.join([name, *commands])} reversed"
             remedy = "let these columns count as the model's axis does"
-            yield Reading("reversed", where, what, remedy, _reversed(i, speed, motors[i]), positions)
+            yield Reading("reversed", where, what, remedy, _reversed(i, speed, motors[i]), positions, (name,))
 
 
-def misread(found: Found, set_up: SetUp) -> list[Finding]:
+def misread(found: Found, set_up: SetUp) -> list[Hint]:
     """The way of reading by which the model errs far less, with what was found for it as far as that is needed then."""
     data, train = set_up.fitted, found.on.fine.train
     simulation, horizon, model = train.simulation, found.on.fine.horizon, found.selection.model
@@ -122,7 +124,9 @@ def misread(found: Found, set_up: SetUp) -> list[Finding]:
     if best is None or share > CLEARLY:
         return []
     message = f"{best.what} the model errs by {share:.0%} of what it does: {best.remedy} and trace again"
-    return [Finding(best.kind, best.where, message)]
+    names = object_names(set_up.nominal, "joint")
+    bodies = frozenset(int(set_up.nominal.jnt_bodyid[names.index(joint)]) for joint in best.joints)
+    return [Hint(best.kind, best.where, message, bodies=bodies or None, left=share)]
 
 
 def _exchanged(count: int, i: int, j: int) -> list[int]:

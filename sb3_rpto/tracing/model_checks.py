@@ -12,12 +12,15 @@ from scipy.signal import savgol_filter
 
 from sb3_rpto.effects import Declared, Simulation
 from sb3_rpto.effects.actuation import FILTERS
-from sb3_rpto.effects.names import hinges, near, object_names
+from sb3_rpto.effects.names import near, object_id, object_names
 from sb3_rpto.effects.simulation import prepare
 from sb3_rpto.effects.world import BatchWorld
-from sb3_rpto.tracing.checks import WINDOW, Finding, smoothed_velocity
+from sb3_rpto.tracing.along import actuation, inverse, through, window_of
+from sb3_rpto.tracing.checks import Finding, smoothed_velocity
 from sb3_rpto.tracing.columns import columns_of, joint_of
+from sb3_rpto.tracing.degrees import check_degrees, large_angles
 from sb3_rpto.tracing.measurements import Measurements
+from sb3_rpto.tracing.unreached import Hint, mocap_bodies, moved_by_mocap, of_actuator
 from sb3_rpto.tracing.windows import command_order, discretised, stiff
 
 ALL = "all episodes"
@@ -29,18 +32,19 @@ LONGEST_STEP = 0.5
 """Samples farther apart than this, in s, are taken for times in another unit."""
 SHORTEST_STEP = 0.01
 """Samples nearer to each other than this share of the model's step are taken for times in another unit."""
-TURNS = 2
-"""Hinges that move over more turns than this are said to: the angles may be in degrees."""
 SOFT = 0.005
 """Dry friction with a longer time constant than this, in s, creeps by more than the noise (MuJoCo's default: 0.02)."""
 LAG = 2
 """A response that is later than this many samples is reported."""
-SMOOTHING = 0.06
-"""Time that the filter of noisy recordings spans, in s."""
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # the first of the scalar ones
-_LIMIT = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)  # the first of limits and contacts
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-_KNOWN_DYNAMICS = (int(mujoco.mjtDyn.mjDYN_NONE), *FILTERS)
+_NO_DYNAMICS, _USER = int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtDyn.mjDYN_USER)
+_STATES = {
+    int(mujoco.mjtDyn.mjDYN_INTEGRATOR): "it integrates its command",
+    int(mujoco.mjtDyn.mjDYN_PID): "the integral of its regulator",
+    int(mujoco.mjtDyn.mjDYN_DCMOTOR): "its current, temperature, friction or the integral of its regulator",
+    _USER: "dyntype user",
+}
 _NO_BIAS, _FIXED = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtGain.mjGAIN_FIXED)
 _MAX_LAG = 25
 _FEWEST = 30
@@ -64,13 +68,14 @@ def check_against(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     :return: what was found, nothing is repaired
     :raises ValueError: joints or actuators that are not in both, or a wrong number of coordinates (the message names
         the nearest names), actuators that integrate their commands, a clock that is not in seconds, commands that are
-        mostly out of range, ``param`` columns with values that the number cannot have
+        mostly out of range, angles that are in degrees, ``param`` columns with values that the number cannot have
     """
     check_names(model, data)
     _check_actuators(model)
     check_clock(model, data)
     _check_settings(model, data)
-    return _sampling(model, data) + _clipped(model, data) + _responses(model, data)
+    check_degrees(model, data)
+    return _sampling(model, data) + mocap_bodies(model) + _clipped(model, data) + _responses(model, data)
 
 
 def check_names(model: mujoco.MjModel, data: Measurements) -> None:
@@ -111,9 +116,9 @@ def _check_actuators(model: mujoco.MjModel) -> None:
         count, dynamics = model.actuator_ctrlnum[i], int(model.actuator_dyntype[i])
         if count != 1:
             raise ValueError(f"actuator {name!r} takes {count} commands; traced are those of one, such as <position>")
-        known = dynamics in _KNOWN_DYNAMICS
-        if not known or model.actuator_actnum[i] > (dynamics in FILTERS):
-            kind = "of a plugin" if known else f"dyntype {mujoco.mjtDyn(dynamics).name.removeprefix('mjDYN_').lower()}"
+        states = int(model.actuator_actnum[i])
+        if states > (dynamics in FILTERS) or dynamics == _USER:
+            kind = _STATES.get(dynamics, "of a plugin")
             raise ValueError(
                 f"actuator {name!r} has a state of its own ({kind}) that no column holds and no commands tell; "
                 "model it without, and give what it puts out as its command"
@@ -138,6 +143,8 @@ def soft_ties(model: mujoco.MjModel) -> list[Finding]:
     """Equality constraints that give way as MuJoCo's do where nothing else is said; those of a machine hardly do."""
     found = []
     for tie in np.flatnonzero((model.eq_solref[:, 0] > SOFT) & (model.eq_active0 != 0)):
+        if moved_by_mocap(model, int(tie)):  # which nobody knows to be where it is taken to be
+            continue
         message = (
             f"the constraint gives way over some {1e3 * model.eq_solref[tie, 0]:g} ms (its solref); where the "
             f'machine\'s is rigid, set solref="{max(0.002, 2 * model.opt.timestep):g} 1" '
@@ -241,24 +248,23 @@ def _clipped(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     return found
 
 
-def doubts(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
+def doubts(model: mujoco.MjModel, data: Measurements) -> list[Hint]:
     """What may be wrong where nothing explains recordings: angles in degrees, constant commands, limits of motors."""
-    found, joints = [], hinges(model)
-    for i, name in enumerate(data.columns.qpos):
-        turns = float(np.median([np.ptp(e.qpos[:, i]) for e in data.episodes])) / (2 * np.pi)
-        if name in joints and turns > TURNS:
-            message = (
-                f"it spans {turns:.0f} turns in a typical run; if it is in degrees, give rad (also where the MJCF has "
-                'angle="degree")'
-            )
-            found.append(Finding("large angle", f"{ALL}, qpos.{name}", message))
-    for i, name in enumerate(data.columns.ctrl):
-        commands = np.concatenate([e.ctrl[:, i] for e in data.episodes])
+    found: list[Hint] = []
+    for name, turns in large_angles(model, data).items():
+        message = (
+            f"it spans {turns:.0f} turns in a typical run; if it is in degrees, give rad (also where the MJCF has "
+            'angle="degree")'
+        )
+        there = frozenset({int(model.jnt_bodyid[object_id(model, "joint", name)])})
+        found.append(Hint("large angle", f"{ALL}, qpos.{name}", message, bodies=there))
+    for column, (name, i) in enumerate(zip(data.columns.ctrl, command_order(model, data))):
+        commands = np.concatenate([e.ctrl[:, column] for e in data.episodes])
         if np.ptp(commands) == 0:
             message = f"it is {commands[0]:g} throughout; is that what the actuator was told?"
-            found.append(Finding("constant command", f"{ALL}, ctrl.{name}", message))
+            found.append(Hint("constant command", f"{ALL}, ctrl.{name}", message, bodies=of_actuator(model, i)))
     for column, (name, i) in enumerate(zip(data.columns.ctrl, command_order(model, data))):
-        plain = model.actuator_biastype[i] == _NO_BIAS and model.actuator_dyntype[i] == _KNOWN_DYNAMICS[0]
+        plain = model.actuator_biastype[i] == _NO_BIAS and model.actuator_dyntype[i] == _NO_DYNAMICS
         if not (plain and model.actuator_forcelimited[i] and model.actuator_gaintype[i] == _FIXED):
             continue
         forces = model.actuator_gainprm[i, 0] * np.concatenate([e.ctrl[:, column] for e in data.episodes])
@@ -269,7 +275,7 @@ def doubts(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
                 f"{beyond:.1%} of the samples ask for more than the model's forcerange [{low:g}, {high:g}], where it "
                 "limits the force: is that the machine's range?"
             )
-            found.append(Finding("limited force", f"{ALL}, ctrl.{name}", message))
+            found.append(Hint("limited force", f"{ALL}, ctrl.{name}", message, bodies=of_actuator(model, i)))
     return found
 
 
@@ -327,7 +333,7 @@ def _signs(where: str, fits: dict[str, tuple[float, float]]) -> list[Finding]:
     if not right:
         return []
     message = "here, unlike in other runs, the motion needs the opposite force (correlation {:.2f}); kept as it is"
-    return [Finding("flipped sign", f"{run}, {where}", message.format(fits[run][0])) for run in flipped]
+    return [Finding.of_run("flipped sign", run, where, message.format(fits[run][0])) for run in flipped]
 
 
 def _correlate(parts: list[_Force]) -> tuple[np.ndarray, np.ndarray] | None:
@@ -373,27 +379,27 @@ def _forces(model: mujoco.MjModel, data: Measurements) -> Iterator[_Force]:
             model = world.batch.get_model(0)
         time = episode.time[rows]
         step = float(np.median(np.diff(time)))
-        window = 5 if data.exact else int(np.clip(SMOOTHING / step, WINDOW, 101)) // 2 * 2 + 1
+        window = window_of(step, data.exact)
         qpos, qvel = episode.qpos[rows][:, order["qpos"]], episode.qvel[rows][:, order["qvel"]]
         qacc = smoothed_velocity(time, qvel, window)
         if not data.exact:
             size = min(window, n - (n + 1) % 2)
             qpos, qvel = (savgol_filter(array, size, 3, axis=0) for array in (qpos, qvel))
-        inverse, free = _inverse(model, qpos, qvel, qacc)
+        needed, free = inverse(model, qpos, qvel, qacc)
         ctrl = episode.ctrl[rows][:, order["ctrl"]]
-        idle = _actuation(model, time, qpos, qvel, np.zeros_like(ctrl))
-        told = _actuation(model, time, qpos, qvel, ctrl) - idle
+        idle = actuation(model, time, qpos, qvel, np.zeros_like(ctrl))
+        told = actuation(model, time, qpos, qvel, ctrl) - idle
         usable = free & episode.usable[rows] & episode.enabled[rows].all(axis=1)
         clear = binary_erosion(usable, np.ones(window), border_value=1)
         for j in np.flatnonzero(model.jnt_type >= _SLIDE).tolist():
             dof = model.jnt_dofadr[j]
             if np.any(told[:, dof]):
-                given = _through(time, told[:, dof], window)
-                yield _Force(episode.run, _label(model, j), (inverse - idle)[:, dof], given, clear)
+                given = through(time, told[:, dof], window)
+                yield _Force(episode.run, _label(model, j), (needed - idle)[:, dof], given, clear)
             name = own.qvel[dof]
             if name in data.columns.qfrc:
                 measured = episode.qfrc[rows][:, data.columns.qfrc.index(name)]
-                yield _Force(episode.run, f"qfrc.{name}", inverse[:, dof], _through(time, measured, window), clear)
+                yield _Force(episode.run, f"qfrc.{name}", needed[:, dof], through(time, measured, window), clear)
 
 
 def _label(model: mujoco.MjModel, joint: int) -> str:
@@ -401,45 +407,3 @@ def _label(model: mujoco.MjModel, joint: int) -> str:
     actuators = np.flatnonzero(on_joint & (model.actuator_trnid[:, 0] == joint))
     names = [columns_of(model).ctrl[model.actuator_ctrladr[a]] for a in actuators]
     return f"ctrl.{names[0]}" if len(names) == 1 else f"commands on {columns_of(model).qvel[model.jnt_dofadr[joint]]}"
-
-
-def _through(time: np.ndarray, force: np.ndarray, window: int) -> np.ndarray:
-    """A force as the filter of the acceleration shows it: held from sample to sample, integrated, differentiated."""
-    impulse = np.concatenate([[0.0], np.cumsum(force[:-1] * np.diff(time))])
-    return smoothed_velocity(time, impulse, window)
-
-
-def _inverse(
-    model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, qacc: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Forces that a motion needs beyond the model's passive ones, (T, nv), and where no contact or limit acts, (T,)."""
-    data = mujoco.MjData(model)
-    forces, free = np.empty((len(qpos), model.nv)), np.empty(len(qpos), dtype=bool)
-    for k in range(len(qpos)):
-        data.qpos[:], data.qvel[:], data.qacc[:] = qpos[k], qvel[k], qacc[k]
-        mujoco.mj_normalizeQuat(model, data.qpos)
-        mujoco.mj_inverse(model, data)
-        forces[k] = data.qfrc_inverse
-        free[k] = not np.any(data.efc_type >= _LIMIT)
-    return forces, free
-
-
-def _actuation(
-    model: mujoco.MjModel, time: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray
-) -> np.ndarray:
-    """Generalised forces of the model's actuators along a given motion, (T, nv)."""
-    data = mujoco.MjData(model)
-    forces = np.empty((len(qpos), model.nv))
-    # Actuators with a memory are led along the motion by the simulator's own steps.
-    substeps = max(1, round(float(np.median(np.diff(time))) / model.opt.timestep)) if model.na or model.nhistory else 0
-    for k in range(len(qpos)):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[k], qvel[k], ctrl[k]
-        mujoco.mj_normalizeQuat(model, data.qpos)
-        if substeps:
-            mujoco.mj_step(model, data, substeps)
-        else:
-            mujoco.mj_fwdPosition(model, data)
-            mujoco.mj_fwdVelocity(model, data)
-            mujoco.mj_fwdActuation(model, data)
-        forces[k] = data.qfrc_actuator
-    return forces

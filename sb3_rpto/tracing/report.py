@@ -16,7 +16,7 @@ from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.files import json_text, plain
 from sb3_rpto.tracing import wording
 from sb3_rpto.tracing.adequacy import Adequacy
-from sb3_rpto.tracing.checks import Finding, grouped
+from sb3_rpto.tracing.checks import Finding
 from sb3_rpto.tracing.evaluate import HorizonError
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.residuals import ForceResidual
@@ -133,7 +133,7 @@ class Report:
     :param learnable: share of what is left that a small regressor predicts, (nv,); NaN where only rounding is left
     :param residuals_before: the force residuals themselves, an item for each run that is long enough
     :param residuals_after: of the corrected model
-    :param findings: all that was found and repaired in the data
+    :param findings: all that was found and repaired in the data, what several runs have in common once
     :param zeros: encoder zeros that differ by run; None where none clearly do
     :param noise: of each position column, rad or m
     :param runs: names of the train, select and test runs
@@ -264,7 +264,7 @@ class Report:
         if idle:
             lines += ["", "not excited by these data", *wording.aligned(idle)]
         if self.findings:
-            lines += ["", "findings", *(f"  {f}" for f in grouped(self.findings))]
+            lines += ["", "findings", *(f"  {f}" for f in self.findings)]
         return "\n".join(lines)
 
     def _values(self, found: list[Traced]) -> list[list[str]]:
@@ -381,7 +381,9 @@ class Report:
             "force_before": forces(self.force_before),
             "force_after": forces(self.force_after),
             "learnable": forces(self.learnable),
-            "findings": [vars(f) for f in self.findings],
+            "findings": [
+                {"kind": f.kind, "where": f.where, "message": f.message, "runs": [*f.runs]} for f in self.findings
+            ],
             "zeros": self.zeros and self.zeros.to_json(),
             "noise": self.noise,
             "runs": self.runs,

@@ -34,7 +34,7 @@ from sb3_rpto.tracing.cautions import (
     unstable,
     vague_noise,
 )
-from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.checks import Finding, grouped
 from sb3_rpto.tracing.conclude import Searched, conclude
 from sb3_rpto.tracing.evaluate import HorizonError, horizon_errors, noise_floor
 from sb3_rpto.tracing.identify import Fit, Problem
@@ -51,6 +51,7 @@ from sb3_rpto.tracing.screen import Screening
 from sb3_rpto.tracing.search import Found, find, worth_a_look
 from sb3_rpto.tracing.select import Selection, Selector
 from sb3_rpto.tracing.undeclared import undeclared_mass
+from sb3_rpto.tracing.unreached import instead
 
 _NEVER = "beside what is kept it lowers the error of unseen windows by nothing clear"
 #: Another effect's typical error that is still as good, as a multiple.
@@ -177,7 +178,7 @@ def trace(
         ),
         residuals_before=residuals_before,
         residuals_after=residuals_after,
-        findings=findings,
+        findings=grouped(findings),
         zeros=zeros,
         noise=dict(zip(data.columns.qpos, sigma.tolist())),
         runs={
@@ -238,14 +239,14 @@ def _of_the_verdict(
             *own_steps(set_up.nominal, simulation, values, fitted, sigma, horizon),
         ]
     named = found.selection.model.effects
-    return [
+    hints = [
         *doubts(set_up.nominal, fitted),
         *misread(found, set_up),
         *undeclared_mass(found, set_up),
-        *(no_nearer(before, after) if named else []),
         *finer_steps(problem, values, found.on.fine.free(named), fitted, horizon),
         *(soft_instead(problem, values, named) if not fitted.simulated else []),
     ]
+    return [*instead(set_up.nominal, hints, found.after.ratio), *(no_nearer(before, after) if named else [])]
 
 
 def _steady(progress: Progress | None) -> Progress:

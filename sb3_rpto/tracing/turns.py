@@ -42,7 +42,8 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
             if name not in joints:  # a coordinate of a ball or free joint, or a name that is refused later
                 continue
             joint = joints.index(name)
-            where, limited = f"{episode.name}, qpos.{name}", bool(model.jnt_limited[joint])
+            run, place, limited = episode.name, f"qpos.{name}", bool(model.jnt_limited[joint])
+            where = f"{run}, {place}"
             low, high = model.jnt_range[joint] if limited else (-np.inf, np.inf)
             if limited and model.jnt_type[joint] == _HINGE:
                 _check_radians(qpos[:, column], low, high, where)
@@ -52,13 +53,14 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
                 turns, why = _turns_off(model, data, episode, joint, qpos[:, column], where in wrapped)
                 if turns:
                     qpos[:, column] -= 2 * np.pi * turns
-                    found.append(Finding("whole turns", where, f"{turns:+d} turn(s) from the joint's {why}; taken off"))
+                    message = f"{turns:+d} turn(s) from the joint's {why}; taken off"
+                    found.append(Finding.of_run("whole turns", run, place, message))
             over = float(np.maximum(low - qpos[:, column], qpos[:, column] - high).max())
             if over > BEYOND and not (data.exact or data.simulated):
                 message = (
                     f"up to {over:.3g} beyond the joint's limits in the model (rad or m): another zero, or other units"
                 )
-                found.append(Finding("outside limits", where, message))
+                found.append(Finding.of_run("outside limits", run, place, message))
         episodes.append(replace(episode, qpos=qpos))
     return replace(data, episodes=episodes), found
 

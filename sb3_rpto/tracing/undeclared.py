@@ -6,11 +6,12 @@ import numpy as np
 
 from sb3_rpto.effects import Declared, Scales, Simulation
 from sb3_rpto.effects.library import candidates
-from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.effects.names import object_id
 from sb3_rpto.tracing.identify import Problem
 from sb3_rpto.tracing.misread import CLEARLY, FITTED, ITERATIONS, WINDOWS
 from sb3_rpto.tracing.prepare import SetUp
 from sb3_rpto.tracing.search import Found
+from sb3_rpto.tracing.unreached import Hint
 from sb3_rpto.tracing.windows import cut
 
 #: A body is looked at with these changes of each; those that promise most are fitted.
@@ -19,7 +20,7 @@ LOOKS = (-0.3, 0.4)
 DECLARE = {"mass_scale": "mass", "inertia_scale": "inertia"}
 
 
-def undeclared_mass(found: Found, set_up: SetUp) -> list[Finding]:
+def undeclared_mass(found: Found, set_up: SetUp) -> list[Hint]:
     """The body with another mass or inertia of which the model errs far less, with what was found where it is needed.
 
     With a mass its inertia goes; a declared mass leaves the inertia that did not go with it. Of a machine's recordings
@@ -55,4 +56,5 @@ def undeclared_mass(found: Found, set_up: SetUp) -> list[Finding]:
         f"with {times:.3g} times its {what} the model errs by {share:.0%} of what it does: declare {scale.on}.{what}, "
         "and trace again"
     )
-    return [Finding(f"undeclared {what}", scale.on, message)]
+    where = frozenset({object_id(set_up.nominal, "body", scale.on)})
+    return [Hint(f"undeclared {what}", scale.on, message, bodies=where, left=share)]

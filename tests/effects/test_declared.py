@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from sb3_rpto.effects import Declared, Scales, declare, parameter_names
 from sb3_rpto.effects.carry import correct
+from sb3_rpto.effects.library import candidates
 from sb3_rpto.effects.world import BatchWorld, LiveWorld, World
 
 MODEL = mujoco.MjModel.from_xml_string("""
@@ -337,3 +338,24 @@ def test_gears_may_be_negative_or_along_another_axis() -> None:
     corrected = correct(model, [motor.with_values(np.array([-3.0])), rotor.with_values(np.array([1.5]))])
     assert corrected.actuator_gear[0, 0] == -3.0
     np.testing.assert_allclose(corrected.actuator_gear[1], [0, 0, 1.5, 0, 0, -0.03])
+
+
+@pytest.mark.parametrize("joint", ["a=b", "a=1:2", "=", "x.y=z", "[0]=*", "k=0.1:0.9"])
+def test_names_of_objects_may_have_an_equals_sign(joint: str) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><body name="arm"><joint name="{joint}" damping=".1"/><geom size=".1" mass="1"/></body>'
+        "</worldbody></mujoco>"
+    )
+    for entry in (f"{joint}.damping", f"joint:{joint}.damping", "*.damping"):
+        (one,) = declare(model, [entry])
+        assert (one.owner, one.index) == ("joint", 0)
+        (bounded,) = declare(model, [f"{entry}=0.05:0.5"])
+        assert (bounded.parameters[0].lower, bounded.parameters[0].upper) == (0.05, 0.5)
+        assert declare(model, [bounded.label])[0].number == one.number
+    assert "viscous_friction" not in {e.kind for e in candidates(model, ["*.damping"])}
+    with pytest.raises(ValueError, match="write bounds as <name>=<lower>:<upper>"):
+        declare(model, [f"{joint}.damping=5"])
+    with pytest.raises(ValueError, match="write bounds as"):
+        declare(model, ["*.damping=0.1:x"])
+    with pytest.raises(ValueError, match=r"did you mean '.*damping'"):
+        declare(model, [f"{joint}.dampin"])

@@ -410,6 +410,8 @@ def test_gain_is_of_the_command_after_its_limits() -> None:
         '<position name="m" joint="j" kp="8" kv="0.3" forcerange="-6 6"/>',
         '<general name="m" joint="j" gaintype="affine" gainprm="2 .5 -.3" biastype="affine" biasprm=".1 -2 .2"/>',
         '<general name="m" joint="j" gainprm="2" dyntype="filterexact" dynprm="0.05" actearly="true"/>',
+        '<dcmotor name="m" joint="j" gear="3" motorconst=".3 .2" resistance=".4" cogging=".1 6 .3" damping=".02"/>',
+        '<dcmotor name="m" joint="j" motorconst=".3 .3" resistance=".4" ctrlrange="-1 1"/>',
     ):
         model = mujoco.MjModel.from_xml_string(xml.replace("ACTUATOR", actuator))
         sim = Simulation(model, [LIBRARY["command_gain"]("m")], 1)
@@ -425,8 +427,12 @@ def test_gain_is_of_the_command_after_its_limits() -> None:
 def test_gain_sits_where_the_force_is_linear_in_it() -> None:
     model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body>
     </worldbody><actuator><motor name="plain" joint="j"/><muscle name="pull" joint="j" lengthrange="0 1"/>
-    <general name="affine" joint="j" gaintype="affine" gainprm="2 .5 0"/></actuator></mujoco>""")
-    assert LIBRARY["command_gain"].places(model) == ["plain", "affine"]
+    <general name="affine" joint="j" gaintype="affine" gainprm="2 .5 0"/>
+    <dcmotor name="volts" joint="j" motorconst=".3 .3" resistance="1"/>
+    <dcmotor name="heats" joint="j" motorconst=".3 .3" resistance="1" thermal="1 1 1"/>
+    <dcmotor name="regulated" joint="j" motorconst=".3 .3" resistance="1" input="pos" controller="10"/>
+    </actuator></mujoco>""")
+    assert LIBRARY["command_gain"].places(model) == ["plain", "affine", "volts"]
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])

@@ -58,7 +58,7 @@ def test_a_light_joint_under_noise_for_commands_is_missed_by_the_model_of_anothe
     after, floor = horizon_errors(own, own.null, data, sigma, 0), noise_floor(own, own.null, data, sigma, 0)
     assert after[0].rmse > 10 * floor[0].rmse  # what smoothing shifts the starts by is no part of the floor
     assert missed(own, own.null, data, sigma, 0) == []
-    assert [f.where for f in missed(other, other.null, data, sigma, 0)] == ["0, 1"]
+    assert [f.where for f in missed(other, other.null, data, sigma, 0)] == ["0 and 1"]
 
 
 def test_a_sensor_at_a_tied_joint_is_told() -> None:

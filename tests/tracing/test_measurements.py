@@ -55,7 +55,7 @@ def test_it_prints_in_a_line():
     data = several(2)
     assert repr(data) == str(data) == "<Measurements: 2 episodes, 400 samples, 3.98 s; joints hinge; actuators motor>"
     gaps = [checks.Finding("gap", f"episode {i}", "cut in two") for i in range(3)]
-    assert str(replace(data, findings=gaps)) == f"{data!r}\n  gap in episode 0 and 2 more: cut in two"
+    assert str(replace(data, findings=gaps)) == f"{data!r}\n  gap in episode 0, episode 1 and episode 2: cut in two"
 
 
 def test_clean_data_have_no_findings():
@@ -177,9 +177,6 @@ def test_files_need_the_same_columns():
         ("time,qpos.hinge\n0,1\n0.1,\n", r"'qpos.hinge' has 1 NaN or infinite value\(s\), first in row 1"),
         ("time,qpos.hinge\n", "0 rows are too few"),
         ("episode,time,qpos.hinge\n", "no rows"),
-        ("time;qpos.hinge\n0;1\n", "the columns are separated by ';'; separate them by commas"),
-        ("# robot log\ntime,qpos.hinge\n0,1\n", "the first line is '# robot log', a comment; remove"),
-        ('time,qpos.hinge\n0,"0,5"\n', "holds '0,5', which is no number, .*; write decimals with a point"),
         ("time,qpos.hinge,temperature\n0,1,2\n", "unknown column 'temperature'.* rename it, or drop"),
     ],
 )
@@ -204,7 +201,63 @@ def test_a_run_with_another_clock_is_refused_by_name(other):
 def test_what_is_found_in_many_places_is_said_once():
     tables = {f"run{i}": {k: v for k, v in swing(phase=i).items() if k != "qvel.hinge"} for i in range(3)}
     (once,) = grouped(Measurements.from_tables(tables).findings)
-    assert (once.kind, once.where) == ("missing velocity", "run0, qvel.hinge and 2 more")
+    assert (once.kind, once.where) == ("missing velocity", "qvel.hinge of run0, run1 and run2")
+    assert once.runs == ("run0", "run1", "run2")
+
+
+def test_what_differs_by_run_in_numbers_alone_is_a_line_with_their_range():
+    tables = {}
+    for run in range(8):
+        rng, table = np.random.default_rng(run), swing(phase=run)
+        table["time"] = table["time"] + (0.002 + 0.0002 * run) * rng.uniform(-1, 1, 200)
+        tables[f"run{run}"] = {k: v for k, v in table.items() if k != "qvel.hinge"}
+    data = Measurements.from_tables(tables)
+    shares = [f.message.split()[3].rstrip("%") for f in data.findings if f.kind == "jitter"]
+    assert len(shares) == 8
+    found = grouped(data.findings)
+    assert [f.kind for f in found] == ["jitter", "missing velocity"]
+    assert found[0].where == "time of run0, run1, run2, run3, run4, run5 and 2 more"
+    least, most = min(shares, key=int), max(shares, key=int)
+    assert found[0].message.startswith(f"steps vary by {least} to {most}% around their median of ")
+    assert found[0].runs == tuple(tables)
+    assert grouped(found) == found
+    assert len(str(data).splitlines()) == 3
+
+
+def test_a_finding_is_said_of_several_places_and_numbers_of_names_are_no_range():
+    of_run, plain = checks.Finding.of_run, checks.Finding
+    found = grouped(
+        [
+            of_run("gap", "a", "", "1 gap(s), the longest 0.5 s"),
+            of_run("glitch", "a", "qpos.x", "3 far"),
+            of_run("glitch", "a", "qpos.y", "3 far"),
+            of_run("gap", "b", "", "12 gap(s), the longest -1.5e-05 s"),
+            of_run("glitch", "b", "qpos.x", "3 far"),
+            of_run("glitch", "b", "qpos.y", "3 far"),
+            of_run("slope", "a", "qvel.x", "it is 2"),
+            of_run("slope", "b", "qvel.y", "it is 3"),
+            of_run("duplicate", "a", "", "the same as episode '1'"),
+            of_run("duplicate", "b", "", "the same as episode '2'"),
+            of_run("other", "a", "", "motor2 moves"),
+            of_run("other", "b", "", "motor3 moves"),
+            plain("soft tie", "equality 0", "gives way over 20 ms"),
+            plain("soft tie", "equality 1", "gives way over 20 ms"),
+            plain("soft tie", "equality 2", "gives way over 30 ms"),
+        ]
+    )
+    assert [str(one) for one in found] == [
+        "gap in a and b: 1 to 12 gap(s), the longest -1.5e-05 to 0.5 s",
+        "glitch in qpos.x and qpos.y of a and b: 3 far",
+        "slope in a, qvel.x: it is 2",
+        "slope in b, qvel.y: it is 3",
+        "duplicate in a: the same as episode '1'",
+        "duplicate in b: the same as episode '2'",
+        "other in a: motor2 moves",
+        "other in b: motor3 moves",
+        "soft tie in equality 0 and equality 1: gives way over 20 ms",
+        "soft tie in equality 2: gives way over 30 ms",
+    ]
+    assert grouped(found) == found
 
 
 def test_gzipped_csv(tmp_path):
@@ -215,7 +268,7 @@ def test_gzipped_csv(tmp_path):
 
 
 def test_a_table_in_another_encoding_is_told(tmp_path):
-    (tmp_path / "a.csv").write_text("time,qpos.hinge\n0,0\n", encoding="utf-16")
+    (tmp_path / "a.csv").write_text("time,qpos.hinge\n°,°\n", encoding="latin-1")
     with pytest.raises(ValueError, match=r"a\.csv: no text in UTF-8 .* save the table as CSV in UTF-8"):
         Measurements.from_csv(tmp_path / "a.csv")
 
@@ -726,7 +779,7 @@ def test_duplicate_is_dropped_and_reported():
     later["time"] = later["time"] + 100.0
     data = Measurements.from_tables({"a": swing(), "b": swing(1.0), "c": later})
     assert [e.name for e in data.episodes] == ["a", "b"]
-    assert [str(f) for f in data.findings] == ["duplicate in c: the same samples as episode a; only that one is kept"]
+    assert [str(f) for f in data.findings] == ["duplicate in c: the same samples as episode 'a'; only that one is kept"]
 
 
 @given(st.integers(1, 15), st.integers(0, 1000))

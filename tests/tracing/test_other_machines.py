@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from simulated import PENDULUM, briefly, compiled, recorded, torques
 
-from sb3_rpto.effects import Simulation, declare
+from sb3_rpto.effects import LIBRARY, Simulation, declare
 from sb3_rpto.effects.carry import correct
 from sb3_rpto.tracing import Measurements, trace
 from sb3_rpto.tracing.checks import align_quaternions
+from sb3_rpto.tracing.model_checks import check_against
 from sb3_rpto.tracing.residuals import force_residuals, summary
 from sb3_rpto.tracing.windows import discretised, stiff
 
@@ -127,14 +128,58 @@ def test_an_actuators_own_delay_is_led_too(nsample: int) -> None:
             '<intvelocity name="motor" joint="hinge" kp="1" actrange="-1 1"/>',
             "state of its own.*integrat",
         ),
-        ('<pid name="motor" joint="hinge"/>', "'motor' takes 2 commands"),
+        (
+            '<dcmotor name="motor" joint="hinge" motorconst=".3 .3" resistance="1" inductance=".01"/>',
+            "own .its current",
+        ),
+        (
+            '<dcmotor name="motor" joint="hinge" motorconst=".3 .3" resistance="1" thermal="1 1 1"/>',
+            "current, temperat",
+        ),
+        ('<pid name="motor" joint="hinge" input="pos" kp="9" ki="1"/>', "state of its own .the integral"),
+        ('<pid name="motor" joint="hinge" kp="9"/>', "'motor' takes 2 commands"),
     ],
 )
 def test_actuators_whose_state_no_column_tells_are_refused(actuator: str, message: str) -> None:
-    names = ["ctrl.motor.0", "ctrl.motor.1"] if "pid" in actuator else ["ctrl.motor"]
+    names = ["ctrl.motor.0", "ctrl.motor.1"] if "2 commands" in message else ["ctrl.motor"]
     table = {"time": np.arange(50) / RATE, **{n: np.zeros(50) for n in ("qpos.hinge", *names)}}
     with pytest.raises(ValueError, match=message):
         trace(machine(actuator), Measurements.from_tables({"a": table}), threads=1)
+
+
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        '<dcmotor name="motor" joint="hinge" motorconst=".3 .3" resistance="1"/>',
+        '<dcmotor name="motor" joint="hinge" motorconst=".3 .3" resistance="1" input="pos" controller="9 0 .2"/>',
+        '<pid name="motor" joint="hinge" input="pos" kp="9"/>',
+    ],
+)
+def test_actuators_of_a_kind_that_may_have_a_state_and_have_none_are_traced(actuator: str) -> None:
+    xml = machine(actuator)
+    assert {f.kind for f in check_against(compiled(xml), steps(xml, episodes=2, samples=100))} <= {"sampling"}
+
+
+@pytest.mark.slow
+def test_a_dc_motor_is_traced_with_its_back_emf() -> None:
+    """Told apart from the joint's damping are the gain of the amplifier and a late command; a `motor` is not enough."""
+    motor = '<dcmotor name="motor" joint="hinge" motorconst=".3 .3" resistance=".5"/>'
+    nominal = machine(motor, 'damping="0.02"').replace('"0.002" integrator="implicitfast"', '"0.005" integrator="RK4"')
+    (damping,) = declare(compiled(nominal), ["hinge.damping"])
+    there = [damping.with_values(np.array([0.05])), LIBRARY["command_gain"]("motor", change=-0.2)]
+    there.append(LIBRARY["command_delay"]("motor", delay=0.02))
+    data = recorded(there, model=compiled(nominal), episodes=6)
+    report = briefly(
+        nominal, data, ["hinge.damping"], ["command_gain", "command_delay", "viscous_friction", "dc_motor"]
+    )
+    assert report.verdict == "explained"
+    assert {t.label for t in report.effects} == {"command_gain(motor)", "command_delay(motor)"}
+    values = {t.label: t.effect.values[0] for t in (*report.declared, *report.effects)}
+    assert values["hinge.damping"] == pytest.approx(0.05, rel=0.05)
+    assert values["command_gain(motor)"] == pytest.approx(-0.2, abs=0.01)
+    assert values["command_delay(motor)"] == pytest.approx(0.02, abs=0.001)
+    plain = briefly(machine(MOTOR.replace("/>", ' gear=".6"/>'), 'damping="0"'), data, [], ["command_delay"])
+    assert plain.verdict != "explained"
 
 
 @pytest.mark.slow

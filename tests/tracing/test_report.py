@@ -11,13 +11,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from simulated import PENDULUM, briefly, recorded
 
 from sb3_rpto.effects import Drive, Simulation
 from sb3_rpto.effects.carry import load_corrected
 from sb3_rpto.effects.commands import CommandDelay
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.effects.units import units_at
-from sb3_rpto.tracing import Report, trace, wording
+from sb3_rpto.tracing import Measurements, Report, trace, wording
 from sb3_rpto.tracing.adequacy import Adequacy
 from sb3_rpto.tracing.report import Traced
 
@@ -244,3 +245,18 @@ def test_a_report_pickles(report: Report, tmp_path: Path) -> None:
         other.save(tmp_path / "other")
         for file in (tmp_path / "one").iterdir():
             assert (tmp_path / "other" / file.name).read_bytes() == file.read_bytes()
+
+
+@pytest.mark.slow
+def test_what_all_runs_have_in_common_is_said_once_in_text_json_and_html(tmp_path) -> None:
+    table = {n: column for n, column in recorded(episodes=5).tables().items() if not n.startswith("qvel")}
+    found = briefly(PENDULUM, Measurements.from_tables({"log": table}), ["hinge.damping"], candidates=[])
+    found.save(tmp_path)
+    (stored,) = [f for f in json.loads((tmp_path / "report.json").read_text())["findings"] if "velocity" in f["kind"]]
+    assert stored["runs"] == ["0", "1", "2", "3", "4"]
+    where = "qvel.hinge of 0, 1, 2, 3 and 4"
+    assert stored["where"] == where
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert [text.count("missing velocity") for text in (str(found), page)] == [1, 1]
+    assert where in str(found)
+    assert where in page

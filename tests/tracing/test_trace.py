@@ -113,7 +113,7 @@ def test_a_run_that_stalled_is_named_also_where_others_are_judged_on() -> None:
     data.episodes[0] = replace(stuck, qpos=still, qvel=0 * stuck.qvel)
     report = traced_simply(data, kinds=["coulomb_friction"])
     (stray,) = [f for f in report.findings if f.kind == "stray windows"]
-    assert stray.where == "run 0"
+    assert (stray.where, stray.runs) == ("0", ("0",))
     assert stray.message.startswith("5 of 5 windows")
     assert report.effects[0].interval[0, 0] < 0.08 < report.effects[0].interval[1, 0]
 
@@ -140,7 +140,7 @@ def test_a_test_run_unlike_all_others_is_told_beside_the_verdict() -> None:
     report = traced_simply(replace(data, episodes=moved))
     assert report.verdict == simple_report().verdict == "explained"
     (found,) = [f for f in report.findings if f.kind == "missed"]
-    assert found.where == ", ".join(runs)
+    assert found.runs == (*runs,)
     assert "times what noise leaves" in found.message
     assert not [f for f in simple_report().findings if f.kind == "missed"]
 
