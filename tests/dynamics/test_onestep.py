@@ -220,7 +220,7 @@ def test_slopes_are_the_derivatives_by_the_parameters_in_scales(poles):
     values = task.simulation.null * 1.05
     residual, slopes = task.linearise(values, 1e-4)
     assert slopes.shape == (40, 6, 3)
-    np.testing.assert_array_equal(residual, task.residuals(values[None])[0])
+    np.testing.assert_allclose(residual, task.residuals(values[None])[0], rtol=1e-10, atol=1e-11)
     for j in range(3):
         change = 1e-5 * task.scale * (np.arange(3) == j)
         up, down = task.residuals(np.stack([values + change, values - change]))
