@@ -1,8 +1,8 @@
 """Machines behind coarse encoders, without velocities, with a clock that jitters: is nothing too much named?
 
 Twenty sets in which nothing is missing, and twenty that lack one effect: five machines, two of them with position
-servos, each with four kinds of samples. They are simulated without feedback, by the Runge-Kutta method in steps of half a
-millisecond: a semi-implicit method's own errors would show beside the noise.
+servos, each with four kinds of samples. They are simulated without feedback, by the Runge-Kutta method in steps of half
+a millisecond: a semi-implicit method's own errors would show beside the noise.
 """
 
 from __future__ import annotations

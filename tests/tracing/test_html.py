@@ -202,5 +202,5 @@ def test_every_effect_of_the_library_has_a_cause() -> None:
 
 def test_without_matplotlib_the_extra_is_named(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(ImportError, match=r"sb3-rpto\[tracing\]"):
+    with pytest.raises(ImportError, match=r"pip install -e '.\[tracing\]'"):
         render(report)
