@@ -22,6 +22,8 @@ from sb3_rpto.tracing.stops import with_stops
 STARTS = 3
 #: Fewer windows than these hardly show that one stretch of motion is not accounted for.
 FEW = 10
+#: So many effects that meet exact data may be in the place of fewer.
+SEVERAL = 3
 #: Finer steps in time are taken where they lower R by this share: then the steps, not the model, make it.
 FINER = 0.03
 
@@ -301,7 +303,23 @@ def settle(on: Selectors, selection: Selection, screening: Screening) -> Selecti
         likes = Likes(selector, screening)
         selection.model = likes.uniform(selection.model, selection)
         selection.model = likes.simplest(selection.model, selection)
-    return selector.judge(selection)
+    return fewest(selector, selector.judge(selection), worth_a_look(selector, screening))
+
+
+def fewest(selector: Selector, selection: Selection, candidates: Sequence[int]) -> Selection:
+    """Of several sets of effects that meet exact data, the one with fewer effects and parameters.
+
+    What two or three effects meet, one may meet in their place, or in the place of all but one of them.
+    """
+    model = selection.model
+    if not selector.met(model) or not 1 < len(model.effects) <= SEVERAL:
+        return selection
+    keeping: list[list[int]] = [[], *([e] for e in model.effects if len(model.effects) > 2)]
+    for rest in keeping:
+        fewer = selector.in_place_of(model, rest, candidates)
+        if fewer is not None:
+            return selector.judge(Selection(fewer, dropped=dict(selection.dropped)))
+    return selection
 
 
 def judged(selector: Selector, model: Model, seed: int) -> Adequacy:

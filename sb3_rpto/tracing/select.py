@@ -422,6 +422,28 @@ class Selector:
         values[s] = start[s]
         return replace(model.fit, values=values, linear=None)
 
+    def in_place_of(self, model: Model, rest: Sequence[int], candidates: Sequence[int]) -> Model | None:
+        """A model of exact data with one effect in the place of all but the ``rest`` that meets them as well, if any.
+
+        :param model: that meets them
+        :param rest: effects of it that stay
+        :param candidates: what may take the place of the others
+        """
+        smaller = self.model(rest, model.fit)
+        outside = [e for e in candidates if e not in model.effects]
+        for e, begins in self._promised(self.train, smaller.fit, rest, outside).items():
+            effects = sorted([*rest, e])
+            if len(self.free(effects)) >= len(self.free(model.effects)):
+                continue
+            self.say(1.0, f"{self.simulation.effects[e].label} in the place of several")
+            fits = [self.train.fit(b.values, self.free(effects), smaller.fit.starts, JOINT) for b in begins]
+            trial = self._remembered(tuple(effects), min(fits, key=lambda fit: fit.cost))
+            if self.nearly_met(trial) and not self.met(trial):
+                trial = self.led_on(trial)
+            if self.met(trial):
+                return trial
+        return None
+
     def _promised(
         self, part: Problem, base: Fit, kept: Sequence[int], outside: Sequence[int]
     ) -> dict[int, list[Begin]]:
