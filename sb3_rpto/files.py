@@ -126,17 +126,17 @@ def _temporary(path: Path, suffix: str) -> Iterator[Path]:
                 left.unlink()
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{suffix}")
     with _held(temporary):
-        try:
-            yield temporary
-        finally:
-            temporary.unlink(missing_ok=True)
+        yield temporary
 
 
 @contextlib.contextmanager
 def _held(file: Path) -> Iterator[None]:
-    """The file, made if it is not there, with a lock on it."""
+    """The file, made if it is not there, with a lock on it; gone afterwards, unless it was put elsewhere."""
     if fcntl is None:
-        yield  # an open file could not be replaced there
+        try:
+            yield  # an open file could not be replaced there
+        finally:
+            file.unlink(missing_ok=True)
         return
     while True:
         with file.open("ab") as opened:
@@ -145,7 +145,11 @@ def _held(file: Path) -> Iterator[None]:
             # Another thread may have put it in place meanwhile, or another run have swept it before it was locked.
             if not _is_at(opened.fileno(), file):
                 continue
-            yield
+            try:
+                yield
+            finally:
+                if _is_at(opened.fileno(), file):  # once that one is in place, another thread's may be here
+                    file.unlink()
             return
 
 

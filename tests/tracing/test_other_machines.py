@@ -280,9 +280,9 @@ def test_a_test_run_too_short_for_inverse_dynamics_is_reported_without_a_missing
         ({"horizon": 0.0}, "horizon is 0"),
         ({"horizon": float("nan")}, "horizon is nan"),
         ({"horizon": True}, "horizon is True"),
-        ({"seed": -1}, "seed is -1"),
-        ({"calibrate": -1}, "calibrate is -1"),
-        ({"threads": -1}, "threads is -1"),
+        ({"seed": -1}, "seed must be an? .* got -1"),
+        ({"calibrate": -1}, "calibrate must be an? .* got -1"),
+        ({"threads": -1}, "threads must be an? .* got -1"),
         ({"candidates": "spring"}, r"write \['spring'\]"),
     ],
 )
