@@ -122,8 +122,7 @@ def _temporary(path: Path, suffix: str) -> Iterator[Path]:
     _refuse_folder(path, suffix)
     for left in path.parent.glob(f".{glob.escape(path.name)}.*.{suffix}"):
         with contextlib.suppress(OSError):
-            if _is_left(left):
-                left.unlink()
+            _sweep(left)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{suffix}")
     with _held(temporary):
         yield temporary
@@ -160,15 +159,19 @@ def _is_at(opened: int, file: Path) -> bool:
         return False
 
 
-def _is_left(file: Path) -> bool:
-    """Whether nobody writes to a temporary file any more."""
+def _sweep(file: Path) -> None:
+    """Remove a temporary file that nobody writes to any more."""
     if fcntl is not None:
         with file.open("rb") as opened:
             try:
                 fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return True
             except BlockingIOError:
-                return False
+                return
             except OSError:
-                pass
-    return time.time() - file.stat().st_mtime > LEFT
+                pass  # a file system without locks
+            else:
+                if _is_at(opened.fileno(), file):  # under the lock: whoever waits for it looks again
+                    file.unlink()
+                return
+    if time.time() - file.stat().st_mtime > LEFT:
+        file.unlink()
