@@ -259,7 +259,7 @@ def own_steps(
     :param values: parameters, (p,)
     :param horizon: length of the predictions in s
     """
-    if data.exact or data.simulated:
+    if data.exact or (data.simulated and data.substeps == 1):
         return []
     predicted = []
     for one in (simulation, Simulation(nominal, simulation.effects, simulation.nthread)):

@@ -118,6 +118,16 @@ def conclude(
         return set_up, found
 
     set_up, found = read(data, simulated)
+    if found.substeps is not None:
+        finer = replace(data, substeps=found.substeps)
+        other, then = read(finer, True)
+        if _explains(then) or found.screening is None:
+            data, simulated, set_up, found = finer, True, other, then
+            step = 1e3 * set_up.nominal.opt.timestep / data.substeps
+            message = (
+                f"from the model's integrator in steps of {step:g} ms: they meet what the continuous motion misses"
+            )
+            set_up.findings.append(Finding("simulated", "fitted runs", message))
     again = _of_own_steps(set_up, found, declared, threads)
     if again is not None:
         simulated = True
@@ -160,7 +170,7 @@ def _creeps(found: Found) -> bool:
     """Whether dry friction that was found leaves what it would not if it gave way at rest."""
     model = found.selection.model
     share = creeping(found.on.fine.every_window(), model.fit.values, model.effects)[1]
-    return share < SOFTER or (share < 1 - WORSE and share * found.after.ratio <= 1 + TOLERANCE)
+    return share < SOFTER or (share < 1 - WORSE and share * found.after.low <= 1 + TOLERANCE)
 
 
 def _named(found: Found) -> list[Effect]:

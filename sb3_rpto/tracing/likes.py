@@ -149,6 +149,24 @@ class Likes:
         free = self.selector.free([*(i for i in model.effects if i != old), new])
         return problem.fit(values, free, starts, EXCHANGED, tolerance=3e-3)
 
+    def in_all_places(self, selection: Selection) -> Selection:
+        """Name kinds that do as well in the place of all of a kind at once, though one of them alone would not.
+
+        Late sensors of all joints answer to late commands of all of them, where only the commands move the joints.
+        """
+        model = selection.model
+        counts = Counter(self.kinds[e] for e in model.effects)
+        for usual in sorted(kind for kind, places in counts.items() if places > 1):
+            for kind in sorted({*self.kinds} - {"declared", usual}):
+                swaps = {e: i for e, i in self._swaps(model, kind, AKIN).items() if self.kinds[e] == usual}
+                if len(swaps) < counts[usual] or any(i in selection.alike.get(e, []) for e, i in swaps.items()):
+                    continue
+                self.selector.say(1.0, f"{kind} in all places of {usual}")
+                if not self.selector.evidence(model, self._swapped(model, swaps)).clear(*self.selector.limit(model)):
+                    for e, i in swaps.items():
+                        selection.alike[e] = sorted({*selection.alike.get(e, []), i})
+        return selection
+
     def _kind_everywhere(self, model: Model) -> Model:
         """Try each kind in the place of all others that it resembles, at once: one alone may look no better.
 
@@ -157,27 +175,31 @@ class Likes:
         if self.selector.met(model):  # nothing could be better
             return model
         for kind in sorted({*self.kinds} - {"declared"}):
-            like = LIKE if kind in {self.kinds[e] for e in model.effects} else AKIN
-            same = self._excited(kind)
-            if not same:
-                continue
-            nearest = {e: max(same, key=lambda i: self.screening.cosine[e, i]) for e in model.effects}
-            swaps = {e: i for e, i in nearest.items() if self.kinds[e] != kind and self.screening.cosine[e, i] > like}
-            trial_effects = sorted({swaps.get(e, e) for e in model.effects})
+            swaps = self._swaps(model, kind, LIKE if kind in {self.kinds[e] for e in model.effects} else AKIN)
             if len(swaps) < 2:
                 continue
             self.selector.say(1.0, f"{kind} in all places")
-            begin = model.fit
-            for old, new in swaps.items():
-                moved = self._translated(model, old, new).values[self.selector.simulation.slices[new]]
-                begin = replace(begin, values=begin.values.copy(), linear=None)
-                begin.values[self.selector.simulation.slices[new]] = moved
-            trial = self.selector.model(trial_effects, begin, 2 * REFIT)
+            trial = self._swapped(model, swaps)
             if self.selector.nearly_met(trial):  # where all places change at once, kinks hold the fit
                 trial = self.selector.led_on(trial)
             if self.selector.evidence(trial, model).clear(SEEMS):
                 model = trial
         return model
+
+    def _swaps(self, model: Model, kind: str, like: float) -> dict[int, int]:
+        """The likest place of a kind for each effect of another one that it resembles."""
+        same = self._excited(kind)
+        if not same:
+            return {}
+        nearest = {e: max(same, key=lambda i: self.screening.cosine[e, i]) for e in model.effects}
+        return {e: i for e, i in nearest.items() if self.kinds[e] != kind and self.screening.cosine[e, i] > like}
+
+    def _swapped(self, model: Model, swaps: dict[int, int]) -> Model:
+        """The model with others in the place of several effects, fitted."""
+        slices, begin = self.selector.simulation.slices, replace(model.fit, values=model.fit.values.copy(), linear=None)
+        for old, new in swaps.items():
+            begin.values[slices[new]] = self._translated(model, old, new).values[slices[new]]
+        return self.selector.model(sorted({swaps.get(e, e) for e in model.effects}), begin, 2 * REFIT)
 
     def _excited(self, kind: str) -> list[int]:
         """The places of a kind that the data could show."""

@@ -48,6 +48,7 @@ class Measurements:
     :param unobserved: names of ``columns.qpos`` that were not measured: not to be compared with a prediction
     :param exact: whether the samples come from a simulator: no measurement noise, exact velocities
     :param simulated: whether the model's own steps in time are to meet them, noise apart
+    :param substeps: steps of the simulator that made them in one of the model's own, where they are ``simulated``
     :param idle: whether nothing was commanded before a run began, as after the reset of an environment; else its first
         command is taken to have held
     :param touching: whether contacts come and go in these measured data
@@ -61,6 +62,7 @@ class Measurements:
     unobserved: tuple[str, ...] = ()
     exact: bool = False
     simulated: bool = False
+    substeps: int = 1
     idle: bool = False
     touching: bool = False
     noise: Noise | None = None

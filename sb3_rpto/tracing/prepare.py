@@ -106,6 +106,21 @@ class SetUp:
         fine = Selector.on(simulation, self._windows(nominal, horizon), self.scales, horizon, say)
         return replace(self.selectors(horizon, say), fine=fine)
 
+    def of_own_steps(self, substeps: int, horizon: float, say: Progress) -> Selectors | None:
+        """The same with the recordings taken for a simulator's own, ``substeps`` in one step of the model as it was given.
+
+        None for what is a simulator's own already.
+        """
+        if self.fitted.exact or self.fitted.simulated:
+            return None
+        model = self.fine.model.__copy__()
+        model.opt.timestep, model.opt.integrator = self.nominal.opt.timestep / substeps, self.nominal.opt.integrator
+        model.actuator_dyntype[:] = self.nominal.actuator_dyntype
+        train, select = (replace(part, simulated=True, substeps=substeps) for part in (self.train, self.select))
+        there = replace(self, train=train, select=select)._windows(model, horizon)
+        fine = Selector.on(Simulation(model, self.fine.effects, self.fine.nthread), there, self.scales, horizon, say)
+        return Selectors(fine, fine, say)
+
     def _windows(self, model: mujoco.MjModel, horizon: float) -> tuple[Windows, Windows | None]:
         return windows(model, self.train, self.select, self.sigma, horizon, 1 - self.length / horizon)
 
@@ -216,9 +231,9 @@ def with_room(spec: mujoco.MjSpec | None, compiled: mujoco.MjModel, data: Measur
     :param data: recordings
     :raises ValueError: there is not enough room, and nothing tells the MJCF
     """
-    if data.exact or data.simulated:
+    if data.substeps == 1 and (data.exact or data.simulated):
         return compiled
-    step = step_for(compiled, data) / SHORTER
+    step = compiled.opt.timestep / data.substeps if data.simulated else step_for(compiled, data) / SHORTER
     needed = np.ceil(compiled.actuator_delay / step - 1e-9).astype(int)
     lacking = np.flatnonzero(needed > np.where(compiled.actuator_delay > 0, compiled.actuator_history[:, 0], needed))
     if not len(lacking):

@@ -26,6 +26,8 @@ FEW = 10
 SEVERAL = 3
 #: Finer steps in time are taken where they lower R by this share: then the steps, not the model, make it.
 FINER = 0.03
+#: A simulator's own steps are tried where R is no more than this, so many to one of the model's.
+STEPS_ERR, SUBSTEPS = 3.0, (1, 2, 4)
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,8 @@ class Found:
     :param screening: of the candidates; None where nothing is missing
     :param selection: what is kept
     :param after: its adequacy
+    :param substeps: the recordings are a simulator's own, in so many steps to one of the model's, and are to be read so;
+        None: they are not
     """
 
     on: Selectors
@@ -60,11 +64,13 @@ class Found:
     screening: Screening | None
     selection: Selection
     after: Adequacy
+    substeps: int | None = None
 
 
 def find(
     selectors: Callable[[float], Selectors],
     finer: Callable[[float], Selectors | None],
+    of_own_steps: Callable[[int, float], Selectors | None],
     length: float,
     longer: float | None,
     seed: int,
@@ -74,6 +80,7 @@ def find(
 
     :param selectors: on windows of a length in s
     :param finer: the same with finer steps in time; None where there are none to take
+    :param of_own_steps: the same with so many of a simulator's steps to one of the model's; None: they are such already
     :param length: of the windows
     :param longer: of the windows to go on with; None: there are none
     :param seed: of the starts and the resampling
@@ -91,6 +98,9 @@ def find(
             return Found(on, base, before, None, selection, before)
         screening = screen(on.fine.train, within_bounds(on.fine.train, base.fit))
         return Found(on, base, before, screening, selection, judged(on.fine, selection.model, seed))
+    substeps = own_steps(on, base, before, of_own_steps, seed)
+    if substeps is not None:
+        return Found(on, base, before, None, Selection(base), before, substeps)
     on = aligned(on, base.fit.values)
     on.say(0.15, "screening the candidates")
     screening = screen(on.fine.train, within_bounds(on.fine.train, base.fit))
@@ -115,7 +125,33 @@ def find(
     stopped = with_stops(on.fine, selection)
     if stopped is not selection:
         selection, after = stopped, judged(on.fine, stopped.model, seed)
-    return Found(on, base, before, screening, selection, after)
+    substeps = own_steps(on, selection.model, after, of_own_steps, seed) if selection.model.effects else None
+    return Found(on, base, before, screening, selection, after, substeps)
+
+
+def own_steps(
+    on: Selectors, model: Model, seen: Adequacy, of_own_steps: Callable[[int, float], Selectors | None], seed: int
+) -> int | None:
+    """With how many of a simulator's steps to one of the model's the recordings are met, which the motion itself misses.
+
+    Semi-implicit steps of a millisecond err by more than many a sensor does, most after commands that jump.
+
+    :param on: windows
+    :param model: fitted there
+    :param seen: its adequacy
+    :param of_own_steps: as in :func:`find`
+    :param seed: of the resampling
+    """
+    if seen.adequate or seen.ratio > STEPS_ERR:
+        return None
+    for substeps in SUBSTEPS:
+        on.say(0.0, "judging in a simulator's own steps")
+        then = of_own_steps(substeps, on.fine.horizon)
+        if then is None:
+            return None
+        if judged(then.fine, then.fine.model(model.effects, model.fit, iterations=10), seed).adequate:
+            return substeps
+    return None
 
 
 def within_bounds(problem: Problem, fit: Fit) -> Fit:
@@ -303,6 +339,7 @@ def settle(on: Selectors, selection: Selection, screening: Screening) -> Selecti
         likes = Likes(selector, screening)
         selection.model = likes.uniform(selection.model, selection)
         selection.model = likes.simplest(selection.model, selection)
+    selection = Likes(selector, screening).in_all_places(selection)
     return fewest(selector, selector.judge(selection), worth_a_look(selector, screening))
 
 

@@ -106,8 +106,8 @@ def trace(
         return prepare(model, data, declared, seed, kinds, horizon, threads, known, simulated, soft)
 
     def search(on: SetUp) -> Found:
-        at, finer = partial(on.selectors, say=say), partial(on.finer, say=say)
-        return find(at, finer, on.length, on.longer, seed, calibrate)
+        at, finer, own = partial(on.selectors, say=say), partial(on.finer, say=say), partial(on.of_own_steps, say=say)
+        return find(at, finer, own, on.length, on.longer, seed, calibrate)
 
     searched = conclude(prepared, search, data, declared, candidates, simulated, threads, seed, say)
     set_up, found, first, zeros = searched.set_up, searched.found, searched.first, searched.zeros

@@ -166,7 +166,9 @@ def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco
     one, or takes MuJoCo's fast one.
     """
     copy = model.__copy__()
-    if not (data.exact or data.simulated):
+    if data.exact or data.simulated:
+        copy.opt.timestep /= data.substeps
+    else:
         copy.opt.timestep = step_for(model, data)
         if fine and stiff(copy):
             copy.opt.integrator = int(_IMPLICIT.get(model.opt.integrator, _FAST))
