@@ -107,9 +107,9 @@ class SetUp:
         return replace(self.selectors(horizon, say), fine=fine)
 
     def of_own_steps(self, substeps: int, horizon: float, say: Progress) -> Selectors | None:
-        """The same with the recordings taken for a simulator's own, ``substeps`` in one step of the model as it was given.
+        """The same with the recordings taken for a simulator's own, or None where they are so already.
 
-        None for what is a simulator's own already.
+        :param substeps: its steps in one of the model as it was given
         """
         if self.fitted.exact or self.fitted.simulated:
             return None

@@ -54,8 +54,8 @@ class Found:
     :param screening: of the candidates; None where nothing is missing
     :param selection: what is kept
     :param after: its adequacy
-    :param substeps: the recordings are a simulator's own, in so many steps to one of the model's, and are to be read so;
-        None: they are not
+    :param substeps: the recordings are to be read as a simulator's own, of so many steps to one of the model's; None:
+        they are not
     """
 
     on: Selectors
@@ -132,7 +132,7 @@ def find(
 def own_steps(
     on: Selectors, model: Model, seen: Adequacy, of_own_steps: Callable[[int, float], Selectors | None], seed: int
 ) -> int | None:
-    """With how many of a simulator's steps to one of the model's the recordings are met, which the motion itself misses.
+    """How many of a simulator's steps to one of the model's meet recordings that the continuous motion misses.
 
     Semi-implicit steps of a millisecond err by more than many a sensor does, most after commands that jump.
 
