@@ -111,7 +111,7 @@ class SetUp:
 
         :param substeps: its steps in one of the model as it was given
         """
-        if self.fitted.exact or self.fitted.simulated:
+        if self.fitted.exact or self.fitted.simulated or self.nominal.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             return None
         model = self.fine.model.__copy__()
         model.opt.timestep, model.opt.integrator = self.nominal.opt.timestep / substeps, self.nominal.opt.integrator
