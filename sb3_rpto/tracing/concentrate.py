@@ -1,4 +1,4 @@
-"""Fits that contacts and dry friction hold in a kink of the cost, led on by the windows that they predict best."""
+"""Fits that are held in a kink or a valley of the cost, led on by short windows and by those that they predict best."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ WORTH, STEPS = 0.9, 30
 ENOUGH = 2.0
 #: Iterations of a fit to a share and of one to all.
 ITERATIONS = 10
+#: Windows are lengthened from so many samples on.
+FIRST = 2
 #: Fits begin anew beside the best one until so many in a row did not pay.
 HOPS = 3
 #: Measured data's only where the typical window errs by less than so many units of the noise.
@@ -25,9 +27,9 @@ NOTHING = 1e-12
 
 
 def led_on(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
-    """Concentrate a fit; where it may still err, begin anew beside the best (basin hopping, Wales and Doye 1997).
+    """Lengthen and concentrate a fit; where it may still err, begin anew beside the best.
 
-    That is done for exact data, until they are met, and where contacts come and go, if little seems to be missing. The
+    The last is basin hopping (Wales and Doye 1997). That is done for exact data, until they are met, and where contacts come and go, if little seems to be missing. The
     starts of other measured data are fitted too and round the kinks off, so there it ends with the concentration.
 
     :param problem: windows
@@ -35,7 +37,7 @@ def led_on(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     :param free: indices of the parameters that may move, (f,)
     :return: never of a higher cost than ``fit``
     """
-    fit, failed, rng = concentrated(problem, fit, free), 0, np.random.default_rng(0)
+    fit, failed, rng = concentrated(problem, lengthened(problem, fit, free), free), 0, np.random.default_rng(0)
     near = problem.touching and np.median(fit.errors) < NEAR
     hops = HOPS if len(free) and (problem.exact or near) else 0
     while failed < hops and fit.errors.max() > ENOUGH:
@@ -46,6 +48,26 @@ def led_on(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
         failed = 0 if trial.cost < WORTH * fit.cost else failed + 1
         fit = min(fit, trial, key=lambda f: f.cost)
     return fit
+
+
+def lengthened(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
+    """Fit the first samples of exact windows, then twice as many, and so on up to whole ones.
+
+    Over a few samples a motion is nearly linear in the parameters, over long windows it may be chaotic: progressive
+    horizons (multiple shooting, Bock 1983) reach the optimum from far away. Noise would hide it in so short windows.
+
+    :param problem: windows
+    :param fit: to them
+    :param free: indices of the parameters that may move, (f,)
+    :return: never of a higher cost than ``fit``
+    """
+    if not (problem.exact and len(free) and fit.errors.max() > ENOUGH):
+        return fit
+    values, samples = fit.values, FIRST
+    while samples < problem.windows.usable.shape[1]:
+        values = problem.first(samples).fit(values, free, fit.starts, 2 * ITERATIONS).values
+        samples *= 2
+    return min(fit, problem.fit(values, free, fit.starts, ITERATIONS), key=lambda f: f.cost)
 
 
 def concentrated(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:

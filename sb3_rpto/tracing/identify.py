@@ -106,6 +106,10 @@ class Problem:
         """The same problem on the windows at ``index``."""
         return Problem(self.simulation, self.windows.take(index), self.scales)
 
+    def first(self, samples: int) -> Problem:
+        """The same problem on the first samples of the windows."""
+        return Problem(self.simulation, self.windows.first(samples), self.scales)
+
     # --- prediction ---------------------------------------------------------------------------------------------
 
     def predict(self, values: np.ndarray, starts: np.ndarray, index: np.ndarray) -> np.ndarray:

@@ -96,6 +96,14 @@ class Windows:
         own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in shared}
         return replace(self, drive=self.drive.take(index), **own)
 
+    def first(self, samples: int) -> Windows:
+        """The windows up to so many samples after their starts."""
+        at, measured, usable = (rows[:, :samples] for rows in (self.at, self.measured, self.usable))
+        drive, steps = self.drive, max(1, int(np.ceil(at.max())))
+        enabled = None if drive.enabled is None else drive.enabled[:, :steps]
+        drive = drive._replace(commands=drive.commands[:, : drive.before + steps], enabled=enabled)
+        return replace(self, drive=drive, at=at, measured=measured, usable=usable)
+
 
 def noise_levels(data: Measurements) -> np.ndarray:
     """Standard deviation of the measurement noise of each position column, (m,).
