@@ -29,8 +29,9 @@ NOTHING = 1e-12
 def led_on(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     """Lengthen and concentrate a fit; where it may still err, begin anew beside the best.
 
-    The last is basin hopping (Wales and Doye 1997). That is done for exact data, until they are met, and where contacts come and go, if little seems to be missing. The
-    starts of other measured data are fitted too and round the kinks off, so there it ends with the concentration.
+    The last is basin hopping (Wales and Doye 1997): for exact data until they are met, and where contacts come and go
+    if little seems to be missing. The starts of other measured data are fitted too and round the kinks off, so there it
+    ends with the concentration.
 
     :param problem: windows
     :param fit: to them

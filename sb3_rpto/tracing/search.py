@@ -152,10 +152,10 @@ def own_steps(
         return None
     best, least = None, np.log(1 - OWN)
     for substeps in SUBSTEPS:
-        on.say(0.0, "judging in a simulator's own steps")
         then = of_own_steps(substeps, on.fine.horizon)
         if then is None:
             return None
+        on.say(0.0, "judging in a simulator's own steps")
         stepped = then.fine.model(model.effects, model.fit, iterations=STEPPED)
         if not seen.adequate and judged(then.fine, stepped, seed).adequate:
             return substeps

@@ -8,10 +8,10 @@ import pytest
 from simulated import compiled, problem, recorded
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_rpto.effects import Simulation, declare
+from sb3_rpto.effects import LIBRARY, Simulation, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.tracing import Measurements, concentrate, trace
-from sb3_rpto.tracing.concentrate import ENOUGH, HOPS, WORTH, concentrated
+from sb3_rpto.tracing.concentrate import ENOUGH, HOPS, WORTH, concentrated, lengthened
 from sb3_rpto.tracing.identify import Fit, Problem
 from sb3_rpto.tracing.residuals import force_residuals, typical
 from sb3_rpto.tracing.windows import cut, discretised, noise_levels
@@ -71,6 +71,32 @@ def test_the_trace_of_a_walker_without_missing_effect_names_none() -> None:
     assert not report.effects
     found = np.array([traced.effect.values[0] for traced in report.declared])
     np.testing.assert_allclose(found, lengths().null * TRUE, rtol=1e-4)
+
+
+def test_a_spring_about_a_far_angle_is_reached_by_windows_that_grow() -> None:
+    """Over whole windows a pole on a cart hides where its spring rests: plain fits end in a valley."""
+    xml = """<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint name="slide" type="slide"
+    axis="1 0 0" damping="1"/><geom size=".05" mass="1" contype="0"/><body name="pole">
+    <joint name="hinge" axis="0 1 0" damping="0.01"/><geom type="capsule" fromto="0 0 0 0 0 .6" size=".02" mass="0.3"
+    contype="0"/></body></body></worldbody><actuator><motor name="motor" joint="slide" gear="5"/></actuator></mujoco>"""
+    model = compiled(xml)
+    there = [d.with_values(d.values * 1.1) for d in declare(model, ["slide.damping", "hinge.damping", "pole.mass"])]
+    spring = LIBRARY["spring"]("hinge", stiffness=0.3, reference=-2.5)
+    data = recorded([*there, spring], model, episodes=6, duration=3.0, noise=0.0, exact=True, rate=50)
+    model = discretised(model, data, fine=True)
+    names = [d.label for d in there]
+    simulation = Simulation(model, [*declare(model, names), LIBRARY["spring"]("hinge")], 1)
+    scales = typical(simulation, force_residuals(simulation, simulation.null, data)).scales(simulation.effects)
+    on = Problem(simulation, cut(model, data, noise_levels(data), 0.8, 12), scales)
+    begin = np.append(simulation.null[:3], [0.05, 1.0])
+    free = np.arange(5)
+    plain = on.fit(begin, free, iterations=40)
+    assert plain.errors.max() > 100 * ENOUGH
+    led = lengthened(on, plain, free)
+    assert led.errors.max() < ENOUGH
+    assert led.values[3:] == pytest.approx([0.3, -2.5], rel=1e-4)
+    assert lengthened(on, led, free) is led
+    assert lengthened(on, plain, free[:0]) is plain
 
 
 def test_a_fit_near_the_noise_stays() -> None:
