@@ -104,6 +104,8 @@ def conclude(
             return set_up, found
 
         set_up, found = searched(kinds)
+        if found.substeps is not None:  # they are read in those steps before anything else is tried
+            return set_up, found
         if not _explains(found) and _creeps(found):
             other, then = searched(_softer(kinds), soft=True)
             if _explains(then) or then.after.ratio < found.after.ratio:
