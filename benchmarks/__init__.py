@@ -1,0 +1,1 @@
+"""Studies that take longer than a test, run from a checkout: ``python -m benchmarks.NAME``."""
