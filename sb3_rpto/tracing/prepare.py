@@ -20,6 +20,7 @@ from sb3_rpto.effects.names import near
 from sb3_rpto.effects.trial import try_out
 from sb3_rpto.envs.steps import odd_step
 from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.clocks import settle_clock
 from sb3_rpto.tracing.contacts import OFTEN, contact_changes
 from sb3_rpto.tracing.measurements import Measurements
 from sb3_rpto.tracing.model_checks import carried_weights, check_against, soft_friction, soft_ties
@@ -161,7 +162,8 @@ def prepare(
     spec, compiled = load_model(model)
     data = replace(data, simulated=data.simulated or simulated)
     data, turned = settle_turns(compiled, data)
-    findings = [*data.findings, *turned, *check_against(compiled, data), *_own_step(model)]
+    data, clock = settle_clock(data)
+    findings = [*data.findings, *turned, *clock, *check_against(compiled, data), *_own_step(model)]
     given(compiled, declared, known)  # what is wrong there is said before the work
     roomy = with_room(spec, compiled, data)
     train, select, test = data.split(seed)

@@ -157,10 +157,9 @@ def own_steps(
             return None
         on.say(0.0, "judging in a simulator's own steps")
         stepped = then.fine.model(model.effects, model.fit, iterations=STEPPED)
-        if not seen.adequate and judged(then.fine, stepped, seed).adequate:
-            return substeps
         saved = float(np.mean(np.log(stepped.fit.errors / model.fit.errors)))
-        if saved < least:
+        explains = not seen.adequate and judged(then.fine, stepped, seed).adequate
+        if saved < (0.0 if explains and best is None else least):
             best, least = substeps, saved
     return best
 

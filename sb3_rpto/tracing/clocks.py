@@ -1,0 +1,77 @@
+"""Clocks whose stamps jitter while the samples do not: a logger that is late by a little, now and then."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sb3_rpto.tracing import checks
+from sb3_rpto.tracing.checks import Finding
+from sb3_rpto.tracing.episodes import Episode
+from sb3_rpto.tracing.measurements import Measurements
+
+#: A clock that jitters by less than this fraction of its interval is even.
+SLIGHT = 0.005
+#: Stamps may be off an even clock by so much of its interval, else they are another sample's.
+WITHIN = 0.45
+#: Positions must be smoother by this share of their variance about a cubic at even times, where they move fast.
+SMOOTHER = 0.05
+#: Samples of each polynomial but one: its order.
+ORDER = 4
+
+
+def settle_clock(data: Measurements) -> tuple[Measurements, list[Finding]]:
+    """Give the samples even times where the stamps jitter and the positions do not follow them.
+
+    A sample that was taken late shows where the joint was then: fast motion is smooth on the stamps. A stamp that was
+    written late shows nothing: it is smooth on an even clock.
+
+    :param data: recordings; not changed
+    :return: the recordings, and what was found
+    """
+    if data.exact or data.simulated:
+        return data, []
+    jittered = {i: even for i, e in enumerate(data.episodes) if (even := _even(e)) is not None}
+    if not jittered:
+        return data, []
+    there = [data.episodes[i] for i in jittered]
+    instead = [replace(data.episodes[i], time=time) for i, time in jittered.items()]
+    ratios = [_roughness(instead, column) / _roughness(there, column) for column in range(len(data.columns.qpos))]
+    if not np.exp(np.mean(np.log(ratios))) < 1 - SMOOTHER:
+        return data, []
+    message = (
+        f"the stamps jitter and the samples do not: on an even clock the positions have {np.mean(ratios):.0%} of the "
+        "noise variance that they have on the stamps, where they move fast; traced with even times"
+    )
+    episodes = [replace(e, time=jittered[i]) if i in jittered else e for i, e in enumerate(data.episodes)]
+    kept = [finding for finding in data.findings if finding.kind != "jitter"]
+    findings = [Finding("even clock", f"time of {data.episodes[i].name}", message) for i in jittered]
+    return replace(data, episodes=episodes, findings=kept), findings
+
+
+def _even(episode: Episode) -> np.ndarray | None:
+    """Times of an even clock near the stamps; None where they do not jitter, or no such clock is near."""
+    time = episode.time
+    if len(time) < 4 * ORDER or checks.jitter(time) <= SLIGHT:
+        return None
+    steps = np.diff(time)
+    ticks = np.append(0, np.cumsum(np.maximum(1, np.round(steps / np.median(steps)))))
+    interval, begin = np.polyfit(ticks, time, 1)
+    even = begin + interval * ticks
+    return even if np.abs(even - time).max() < WITHIN * interval else None
+
+
+def _roughness(episodes: list[Episode], column: int) -> float:
+    """Mean square of the divided differences of a position in the faster half of the motion."""
+    found, moved = [], []
+    for e in episodes:
+        t, q = (np.lib.stride_tricks.sliding_window_view(x, ORDER + 1) for x in (e.time, e.qpos[:, column]))
+        gaps = t[:, :, None] - t[:, None, :]
+        gaps = gaps / np.abs(gaps).max(axis=(1, 2), keepdims=True)
+        weights = 1 / np.prod(np.where(np.eye(ORDER + 1, dtype=bool), 1.0, gaps), axis=2)
+        found.append((weights * q).sum(1) / np.sqrt((weights**2).sum(1)))
+        moved.append(np.ptp(q, axis=1))
+    square, speed = np.concatenate(found) ** 2, np.concatenate(moved)
+    fast = np.sort(square[speed >= np.median(speed)])
+    return float(fast[: max(1, round(0.95 * len(fast)))].mean()) + 1e-300
