@@ -30,7 +30,7 @@ def settle_clock(data: Measurements) -> tuple[Measurements, list[Finding]]:
     :param data: recordings; not changed
     :return: the recordings, and what was found
     """
-    if data.exact or data.simulated:
+    if data.exact:
         return data, []
     jittered = {i: even for i, e in enumerate(data.episodes) if (even := _even(e)) is not None}
     if not jittered:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -23,9 +25,11 @@ def recorded(stamps: float, samples: float, noise: float = 3e-4, slow: float = 1
     return Measurements.from_tables(tables)
 
 
+@pytest.mark.parametrize("simulated", [False, True])
 @pytest.mark.parametrize("lost", [0, 2])
-def test_stamps_that_jitter_give_way_to_an_even_clock(lost: int) -> None:
-    data, findings = settle_clock(recorded(stamps=3e-4, samples=0.0, lost=lost))
+def test_stamps_that_jitter_give_way_to_an_even_clock(lost: int, simulated: bool) -> None:
+    there = recorded(stamps=3e-4, samples=0.0, lost=lost)
+    data, findings = settle_clock(replace(there, simulated=simulated))
     assert [f.kind for f in findings] == ["even clock"] * 2
     assert not [f for f in data.findings if f.kind == "jitter"]
     for e in data.episodes:
