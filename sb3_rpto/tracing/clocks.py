@@ -46,7 +46,7 @@ def settle_clock(data: Measurements) -> tuple[Measurements, list[Finding]]:
     )
     episodes = [replace(e, time=jittered[i]) if i in jittered else e for i, e in enumerate(data.episodes)]
     kept = [finding for finding in data.findings if finding.kind != "jitter"]
-    findings = [Finding("even clock", f"time of {data.episodes[i].name}", message) for i in jittered]
+    findings = [Finding.of_run("even clock", data.episodes[i].name, "time", message) for i in jittered]
     return replace(data, episodes=episodes, findings=kept), findings
 
 
