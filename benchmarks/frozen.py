@@ -3,8 +3,7 @@
     python -m benchmarks.frozen            # run all and compare with the table
     python -m benchmarks.frozen --record   # write the table anew
 
-Bits depend on the processor and on torch: the table is made anew from the commit before a change, on the same computer.
-The counts and the norms hold elsewhere, too, the norms to a few digits.
+Bits depend on the processor and on torch: record the table from the commit before a change, on the same computer.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from sb3_rpto.effects import LIBRARY
 from sb3_rpto.envs.corrected import apply_effects
 
 TABLE = Path(__file__).parent / "results" / "frozen_parameters.csv"
-#: Target steps, as many as an epoch of the paper has and a few more: one fit of the dynamics, updates after it.
+#: Target steps with one fit of the dynamics among them and updates after it, and source steps before.
 STEPS, SOURCE_STEPS = 300, 500
 ENSEMBLE = {"dynamics": "ensemble", "dynamics_kwargs": {"max_steps": 200}}
 PHYSICAL = {"dynamics": "physical", "declared": ["pole.length", "pole2.length"]}
@@ -50,7 +49,7 @@ def target() -> gym.Env:
 
 
 def frozen(name: str) -> dict[str, Any]:
-    """One run: its counts, and the sum, the norm and the digest of its parameters."""
+    """One run: its target steps, and number, norm and digest of its parameters."""
     cls, settings = RUNS[name]
     network = {"net_arch": [32, 32]}
     model = cls(
@@ -67,14 +66,13 @@ def frozen(name: str) -> dict[str, Any]:
         model.learn(STEPS, source_timesteps=SOURCE_STEPS)
     numbers = [p.detach().numpy().ravel() for p in model.policy.state_dict().values()]
     numbers.append(model.log_ent_coef.detach().numpy().ravel())
-    dynamics = getattr(model.dynamics, "state_dict", dict)()
-    numbers += [np.asarray(v, np.float64).ravel() for v in dynamics.values() if isinstance(v, th.Tensor | np.ndarray)]
+    dynamics = model.dynamics.state_dict().values()
+    numbers += [np.asarray(v, np.float64).ravel() for v in dynamics if isinstance(v, th.Tensor | np.ndarray)]
     row = np.concatenate([n.astype(np.float64) for n in numbers])
     digest = hashlib.sha256(row.tobytes()).hexdigest()[:16]
     return {
         "run": name,
         "target_steps": model.num_timesteps,
-        "updates": model._n_updates,
         "parameters": len(row),
         "norm": f"{np.linalg.norm(row):.10g}",
         "sha256": digest,
@@ -86,9 +84,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--record", action="store_true", help="write the table anew")
     asked = parser.parse_args()
+    if not (asked.record or TABLE.exists()):
+        parser.error("there is no table yet: write one by --record, from the commit to compare with")
     th.set_num_threads(1)
     now = pd.DataFrame([frozen(name) for name in tqdm(RUNS, desc="runs")]).astype(str)
     if asked.record:
+        TABLE.parent.mkdir(exist_ok=True)
         now.to_csv(TABLE, index=False)
         print(now.to_string(index=False))
         return

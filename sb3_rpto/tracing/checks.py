@@ -151,6 +151,22 @@ def jitter(time: np.ndarray) -> float:
     return float(np.quantile(np.abs(steps - ticks), 0.95))
 
 
+def divided_differences(time: np.ndarray, position: np.ndarray, order: int) -> np.ndarray:
+    """Divided differences of a position, scaled to the variance of white noise, (T - order,).
+
+    On any clock they vanish on polynomials of a degree below their order.
+
+    :param time: increasing times in s, shape (T,)
+    :param position: shape (T,)
+    :param order: each is of ``order`` + 1 samples
+    """
+    t, q = (np.lib.stride_tricks.sliding_window_view(x, order + 1) for x in (time, position))
+    gaps = t[:, :, None] - t[:, None, :]
+    gaps = gaps / np.abs(gaps).max(axis=(1, 2), keepdims=True)
+    weights = 1 / np.prod(np.where(np.eye(order + 1, dtype=bool), 1.0, gaps), axis=2)
+    return np.asarray((weights * q).sum(1) / np.sqrt((weights**2).sum(1)))
+
+
 def missing(time: np.ndarray) -> int:
     """Number of steps over which, by the others, at least one sample is missing, gaps left out.
 

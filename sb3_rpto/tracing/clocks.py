@@ -15,9 +15,9 @@ from sb3_rpto.tracing.measurements import Measurements
 SLIGHT = 0.005
 #: Stamps may be off an even clock by so much of its interval, else they are another sample's.
 WITHIN = 0.45
-#: Positions must be smoother by this share of their variance about a cubic at even times, where they move fast.
+#: At even times the variance of the differences must be less by this share, where the joint moves fast.
 SMOOTHER = 0.05
-#: Samples of each polynomial but one: its order.
+#: Order of the divided differences that tell smooth motion from noise.
 ORDER = 4
 
 
@@ -66,12 +66,9 @@ def _roughness(episodes: list[Episode], column: int) -> float:
     """Mean square of the divided differences of a position in the faster half of the motion."""
     found, moved = [], []
     for e in episodes:
-        t, q = (np.lib.stride_tricks.sliding_window_view(x, ORDER + 1) for x in (e.time, e.qpos[:, column]))
-        gaps = t[:, :, None] - t[:, None, :]
-        gaps = gaps / np.abs(gaps).max(axis=(1, 2), keepdims=True)
-        weights = 1 / np.prod(np.where(np.eye(ORDER + 1, dtype=bool), 1.0, gaps), axis=2)
-        found.append((weights * q).sum(1) / np.sqrt((weights**2).sum(1)))
-        moved.append(np.ptp(q, axis=1))
+        position = e.qpos[:, column]
+        found.append(checks.divided_differences(e.time, position, ORDER))
+        moved.append(np.ptp(np.lib.stride_tricks.sliding_window_view(position, ORDER + 1), axis=1))
     square, speed = np.concatenate(found) ** 2, np.concatenate(moved)
     fast = np.sort(square[speed >= np.median(speed)])
     return float(fast[: max(1, round(0.95 * len(fast)))].mean()) + 1e-300

@@ -97,7 +97,7 @@ def conclude(
         def searched(kinds: Sequence[str] | None, soft: bool = False) -> tuple[SetUp, Found]:
             set_up = prepared(data, simulated, kinds, soft)
             found = search(set_up)
-            if hidden(found, seed):
+            if found.substeps is None and hidden(found, seed):
                 set_up = set_up.with_all_to_fit()
                 set_up.findings.append(UNLIKE)
                 found = search(set_up)

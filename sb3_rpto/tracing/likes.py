@@ -155,6 +155,8 @@ class Likes:
         Late sensors of all joints answer to late commands of all of them, where only the commands move the joints.
         """
         model = selection.model
+        if self.selector.met(model):  # as only what is right does
+            return selection
         counts = Counter(self.kinds[e] for e in model.effects)
         for usual in sorted(kind for kind, places in counts.items() if places > 1):
             for kind in sorted({*self.kinds} - {"declared", usual}):

@@ -107,7 +107,7 @@ class SetUp:
         fine = Selector.on(simulation, self._windows(nominal, horizon), self.scales, horizon, say)
         return replace(self.selectors(horizon, say), fine=fine)
 
-    def of_own_steps(self, substeps: int, horizon: float, say: Progress) -> Selectors | None:
+    def in_substeps(self, substeps: int, horizon: float, say: Progress) -> Selectors | None:
         """The same with the recordings taken for a simulator's own, or None where they are so already.
 
         :param substeps: its steps in one of the model as it was given

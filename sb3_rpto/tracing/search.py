@@ -26,12 +26,9 @@ FEW = 10
 SEVERAL = 3
 #: Finer steps in time are taken where they lower R by this share: then the steps, not the model, make it.
 FINER = 0.03
-#: A simulator's own steps are tried where R is no more than this, so many to one of the model's.
-STEPS_ERR, SUBSTEPS = 3.0, (1, 2, 4)
-#: They are taken where they lower the windows' errors by this share.
-OWN = 0.05
-#: Iterations of a fit in other steps: parameters make up for some of what steps err by.
-STEPPED = 5
+#: A simulator's steps, so many to one of the model's, are tried where R is no more than the limit, with so few
+#: iterations of the fit; they are taken where they lower the windows' errors by this share.
+SUBSTEPS, SUBSTEPS_LIMIT, SUBSTEPS_FIT, SUBSTEPS_GAIN = (1, 2, 4), 3.0, 5, 0.05
 
 
 @dataclass(frozen=True)
@@ -74,7 +71,7 @@ class Found:
 def find(
     selectors: Callable[[float], Selectors],
     finer: Callable[[float], Selectors | None],
-    of_own_steps: Callable[[int, float], Selectors | None],
+    in_substeps: Callable[[int, float], Selectors | None],
     length: float,
     longer: float | None,
     seed: int,
@@ -84,7 +81,7 @@ def find(
 
     :param selectors: on windows of a length in s
     :param finer: the same with finer steps in time; None where there are none to take
-    :param of_own_steps: the same with so many of a simulator's steps to one of the model's; None: they are such already
+    :param in_substeps: the same with so many of a simulator's steps to one of the model's; None: they are such already
     :param length: of the windows
     :param longer: of the windows to go on with; None: there are none
     :param seed: of the starts and the resampling
@@ -99,11 +96,11 @@ def find(
         on, base, before = closer
         selection = with_stops(on.fine, Selection(base))
         if not selection.model.effects:
-            substeps = own_steps(on, base, before, of_own_steps, seed)
+            substeps = simulator_substeps(on, base, before, in_substeps, seed)
             return Found(on, base, before, None, selection, before, substeps)
         screening = screen(on.fine.train, within_bounds(on.fine.train, base.fit))
         return Found(on, base, before, screening, selection, judged(on.fine, selection.model, seed))
-    substeps = own_steps(on, base, before, of_own_steps, seed)
+    substeps = simulator_substeps(on, base, before, in_substeps, seed)
     if substeps is not None:
         return Found(on, base, before, None, Selection(base), before, substeps)
     on = aligned(on, base.fit.values)
@@ -130,12 +127,12 @@ def find(
     stopped = with_stops(on.fine, selection)
     if stopped is not selection:
         selection, after = stopped, judged(on.fine, stopped.model, seed)
-    substeps = own_steps(on, selection.model, after, of_own_steps, seed) if selection.model.effects else None
+    substeps = simulator_substeps(on, selection.model, after, in_substeps, seed) if selection.model.effects else None
     return Found(on, base, before, screening, selection, after, substeps)
 
 
-def own_steps(
-    on: Selectors, model: Model, seen: Adequacy, of_own_steps: Callable[[int, float], Selectors | None], seed: int
+def simulator_substeps(
+    on: Selectors, model: Model, seen: Adequacy, in_substeps: Callable[[int, float], Selectors | None], seed: int
 ) -> int | None:
     """How many of a simulator's steps to one of the model's meet recordings better than the continuous motion does.
 
@@ -145,23 +142,23 @@ def own_steps(
     :param on: windows
     :param model: fitted there
     :param seen: its adequacy
-    :param of_own_steps: as in :func:`find`
+    :param in_substeps: as in :func:`find`
     :param seed: of the resampling
     """
-    if seen.ratio > STEPS_ERR:
+    if seen.ratio > SUBSTEPS_LIMIT:
         return None
-    best, least = None, np.log(1 - OWN)
+    better = []
     for substeps in SUBSTEPS:
-        then = of_own_steps(substeps, on.fine.horizon)
+        then = in_substeps(substeps, on.fine.horizon)
         if then is None:
             return None
         on.say(0.0, "judging in a simulator's own steps")
-        stepped = then.fine.model(model.effects, model.fit, iterations=STEPPED)
-        saved = float(np.mean(np.log(stepped.fit.errors / model.fit.errors)))
+        stepped = then.fine.model(model.effects, model.fit, iterations=SUBSTEPS_FIT)
+        saved = -float(np.mean(np.log(stepped.fit.errors / model.fit.errors)))
         explains = not seen.adequate and judged(then.fine, stepped, seed).adequate
-        if saved < (0.0 if explains and best is None else least):
-            best, least = substeps, saved
-    return best
+        if explains or saved > -np.log(1 - SUBSTEPS_GAIN):
+            better.append((explains, saved, substeps))
+    return max(better)[2] if better else None
 
 
 def within_bounds(problem: Problem, fit: Fit) -> Fit:

@@ -106,8 +106,9 @@ def trace(
         return prepare(model, data, declared, seed, kinds, horizon, threads, known, simulated, soft)
 
     def search(on: SetUp) -> Found:
-        at, finer, own = partial(on.selectors, say=say), partial(on.finer, say=say), partial(on.of_own_steps, say=say)
-        return find(at, finer, own, on.length, on.longer, seed, calibrate)
+        at, finer = partial(on.selectors, say=say), partial(on.finer, say=say)
+        stepped = partial(on.in_substeps, say=say)
+        return find(at, finer, stepped, on.length, on.longer, seed, calibrate)
 
     searched = conclude(prepared, search, data, declared, candidates, simulated, threads, seed, say)
     set_up, found, first, zeros = searched.set_up, searched.found, searched.first, searched.zeros

@@ -152,12 +152,7 @@ def _differences(episode: Episode, column: int, order: int, held: bool) -> np.nd
     """Divided differences of a position, (n,), each of ``order`` + 1 samples."""
     if len(episode) <= order:
         return np.zeros(0)
-    t = np.lib.stride_tricks.sliding_window_view(episode.time, order + 1)
-    q = np.lib.stride_tricks.sliding_window_view(episode.qpos[:, column], order + 1)
-    gaps = t[:, :, None] - t[:, None, :]
-    gaps = gaps / np.abs(gaps).max(axis=(1, 2), keepdims=True)
-    weights = 1 / np.prod(np.where(np.eye(order + 1, dtype=bool), 1.0, gaps), axis=2)
-    found = (weights * q).sum(1) / np.sqrt((weights**2).sum(1))
+    found = checks.divided_differences(episode.time, episode.qpos[:, column], order)
     if not held:
         return found
     changes = np.any(np.diff(episode.ctrl, axis=0) != 0, axis=1)  # a command acts from its sample on

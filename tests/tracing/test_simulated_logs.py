@@ -56,7 +56,7 @@ def test_a_simulators_own_steps_are_met_where_they_are_shorter_than_the_models()
 
 
 @pytest.mark.slow
-def test_commands_that_are_late_at_all_joints_are_told_from_no_late_sensors() -> None:
+def test_commands_that_are_late_at_all_joints_and_late_sensors_are_one_class() -> None:
     kinds = ["command_delay", "sensor_delay", "coulomb_friction"]
     declared = ["fore.mass", "shoulder.damping", "elbow.damping"]
     report = trace(ARM.format(friction=0, **TWO), log(TWO, mass=1.2, late=15), declared, candidates=kinds, threads=1)
