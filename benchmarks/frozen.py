@@ -1,7 +1,7 @@
 """What a change of structure must not change: parameters of short runs with fixed seeds, to the last bit.
 
-    python -m benchmarks.frozen            # run all and compare with the table
-    python -m benchmarks.frozen --record   # write the table anew
+    python -m benchmarks frozen            # run all and compare with the table
+    python -m benchmarks frozen --record   # write the table anew
 
 Bits depend on the processor and on torch: record the table from the commit before a change, on the same computer.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import warnings
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -20,12 +20,13 @@ import pandas as pd
 import torch as th
 from tqdm import tqdm
 
+from benchmarks import RESULTS
 from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.effects import LIBRARY
 from sb3_rpto.envs.corrected import apply_effects
 
-TABLE = Path(__file__).parent / "results" / "frozen_parameters.csv"
+TABLE = RESULTS / "frozen_parameters.csv"
 #: Target steps with one fit of the dynamics among them and updates after it, and source steps before.
 STEPS, SOURCE_STEPS = 300, 500
 ENSEMBLE = {"dynamics": "ensemble", "dynamics_kwargs": {"max_steps": 200}}
@@ -64,6 +65,8 @@ def frozen(name: str) -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         model.learn(STEPS, source_timesteps=SOURCE_STEPS)
+    assert model.log_ent_coef is not None
+    assert model.dynamics is not None
     numbers = [p.detach().numpy().ravel() for p in model.policy.state_dict().values()]
     numbers.append(model.log_ent_coef.detach().numpy().ravel())
     dynamics = model.dynamics.state_dict().values()
@@ -79,11 +82,11 @@ def frozen(name: str) -> dict[str, Any]:
     }
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Record or compare."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--record", action="store_true", help="write the table anew")
-    asked = parser.parse_args()
+    asked = parser.parse_args(arguments)
     if not (asked.record or TABLE.exists()):
         parser.error("there is no table yet: write one by --record, from the commit to compare with")
     th.set_num_threads(1)
@@ -98,7 +101,3 @@ def main() -> None:
     same = (both["sha256 then"] == both["sha256 now"]).fillna(False)
     print(both.assign(same=same).to_string(index=False))
     raise SystemExit(0 if same.all() else 1)
-
-
-if __name__ == "__main__":
-    main()

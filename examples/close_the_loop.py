@@ -24,11 +24,11 @@ from rich.console import Console
 from rich.table import Table
 from transfer_double_pendulum import draw, source, source_policy
 
+from benchmarks.closed_loop.study import TASKS, make_target, shifted, uncorrected
 from sb3_rpto import RPTO
-from sb3_rpto.experiments.baselines import fine_tuned_sac
-from sb3_rpto.experiments.closed_loop import TASKS, make_target, shifted, uncorrected
-from sb3_rpto.experiments.curve import LearningCurve
-from sb3_rpto.tracing import Report
+from sb3_rpto.baselines.sac_variants import fine_tuned_sac
+from sb3_rpto.evaluation.learning_curve import LearningCurve
+from sb3_rpto.sysid import Report
 
 TASK = "double-pendulum"
 

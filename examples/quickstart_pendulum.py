@@ -14,8 +14,8 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_rpto import RPTO
-from sb3_rpto.dynamics.products import fast_products
-from sb3_rpto.experiments.curve import evaluate
+from sb3_rpto.dynamics.matmul_precision import fast_products
+from sb3_rpto.evaluation.learning_curve import evaluate
 
 
 def pendulum(g: float) -> gym.Env:

@@ -27,7 +27,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_rpto import RPTO
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.tracing import Measurements, Report, trace
+from sb3_rpto.sysid import Measurements, Report, trace
 
 TASK = "InvertedDoublePendulum-v5"
 DECLARED = ["pole.length"]  # what the makers of the simulator are unsure of

@@ -18,12 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.tracing.planting import KINDS, SYSTEMS, draw, generate, places
+from benchmarks.tracing.truth import as_effect, deviation, twins
 from sb3_rpto.effects import Effect
-from sb3_rpto.effects.carry import load_corrected
-from sb3_rpto.experiments.planting import KINDS, SYSTEMS, draw, generate, places
-from sb3_rpto.experiments.tracing_benchmark.truth import as_effect, deviation, twins
-from sb3_rpto.tracing import Measurements, Report, trace
-from sb3_rpto.tracing.evaluate import horizon_errors
+from sb3_rpto.effects.corrected_model_io import load_corrected
+from sb3_rpto.sysid import Measurements, Report, trace
+from sb3_rpto.sysid.shooting.prediction_errors import horizon_errors
 
 MACHINE = "pendulum"
 RATE, NOISE = 250.0, 1e-3  # samples a second; noise of the encoder in rad

@@ -26,11 +26,11 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto import RPTO
 from sb3_rpto.algorithms.update import as_transitions
+from sb3_rpto.baselines.sac_variants import fine_tuned_sac
 from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.base import Transitions
-from sb3_rpto.dynamics.products import fast_products
-from sb3_rpto.experiments.baselines import fine_tuned_sac
-from sb3_rpto.experiments.curve import LearningCurve
+from sb3_rpto.dynamics.matmul_precision import fast_products
+from sb3_rpto.evaluation.learning_curve import LearningCurve
 
 #: Mean return in the source at which the policy counts as converged: 9,360 is the most there is.
 SOLVED = 9_300

@@ -5,7 +5,7 @@ from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.dynamics.env import DynamicsEnv
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.envs.tasks import register_tasks
-from sb3_rpto.tracing import Measurements, trace
+from sb3_rpto.sysid import Measurements, trace
 from sb3_rpto.version import __version__
 
 register_tasks()

@@ -284,13 +284,13 @@ def load_transitions(
     if not isinstance(data, str | pathlib.Path | ReplayBuffer | io.BufferedIOBase):
         raise TypeError(
             f"source_data and target_data are a replay buffer, its pickle or an .npz file, not {type(data).__name__}; "
-            "a robot's log is target_data=Measurements.from_csv(...), from_tables(...), ... (from sb3_rpto.tracing)"
+            "a robot's log is target_data=Measurements.from_csv(...), from_tables(...), ... (from sb3_rpto.sysid)"
         )
     if isinstance(data, str | pathlib.Path) and str(data).endswith((".csv", ".parquet")):
         reader = f"Measurements.from_{str(data).rpartition('.')[2]}({str(data)!r})"
         raise ValueError(
             f"{str(data)!r} is a table; transitions are read from a replay buffer, its pickle or an .npz file. For a "
-            f"robot's log pass target_data={reader} (from sb3_rpto.tracing)"
+            f"robot's log pass target_data={reader} (from sb3_rpto.sysid)"
         )
     if isinstance(data, str | pathlib.Path) and str(data).endswith(".npz"):
         arrays = _load_npz(data, rewards_optional)

@@ -13,12 +13,12 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
-from sb3_rpto.algorithms.source import EpisodeSource
+from sb3_rpto.algorithms.rollouts import EpisodeSource
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.algorithms.update import as_transitions
 from sb3_rpto.buffers import rows_in_order
 from sb3_rpto.dynamics.base import Transitions
-from sb3_rpto.theory import Estimate, dynamics_gap_estimate, policy_gap_estimate
+from sb3_rpto.evaluation.relativity_gap import Estimate, dynamics_gap_estimate, policy_gap_estimate
 
 #: States of the newest one-step branches that stand in for the source's occupancy.
 BRANCH_STATES = 2_000
@@ -43,12 +43,13 @@ class TransferCallback(BaseCallback):
 class RelativityGapCallback(TransferCallback):
     """Log both parts of Lemma 1's relativity gap from what the run has stored; never takes a step in either world.
 
-    ``gap/dynamics`` is J(P', pi) - J(P_phi, pi), estimated by :func:`~sb3_rpto.theory.dynamics_gap_estimate` on the
-    newest whole episodes in D_target with the critic of the source. ``gap/policy`` is J(P_phi, pi) - J(P_phi, pi'),
-    with pi' the policy as it came from the source (``snapshots["source"]``) and its critic, estimated by
-    :func:`~sb3_rpto.theory.policy_gap_estimate` on the newest whole episodes in D_source. One-step branches are no
-    episodes: there it is the mean advantage over the newest branches' states, divided by 1 - gamma, which takes these
-    states for the discounted occupancy of pi. ``gap/dynamics_se`` and ``gap/policy_se`` are the standard errors.
+    ``gap/dynamics`` is J(P', pi) - J(P_phi, pi), estimated by
+    :func:`~sb3_rpto.evaluation.relativity_gap.dynamics_gap_estimate` on the newest whole episodes in
+    D_target with the critic of the source. ``gap/policy`` is J(P_phi, pi) - J(P_phi, pi'), with pi' the policy as it
+    came from the source (``snapshots["source"]``) and its critic, estimated by
+    :func:`~sb3_rpto.evaluation.relativity_gap.policy_gap_estimate` on the newest whole episodes in D_source.
+    One-step branches are no episodes: there it is the mean advantage over the newest branches' states, divided by
+    1 - gamma, which takes these states for the discounted occupancy of pi. ``gap/dynamics_se`` and ``gap/policy_se`` are the standard errors.
 
     All are gaps of soft returns (entropy bonus included; that of the policy gap at the temperature of pi') on the
     critic's reward scale, which VecNormalize may have changed. They are as good as the critics, and the episodes are

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
 import sys
 import tempfile
 import warnings
@@ -22,14 +21,6 @@ BAD_INPUT, INTERRUPTED = 2, 130
 #: What users can cause is said in one line; an error of ours keeps its traceback, unless it is of these kinds, too,
 #: and nobody asked for it.
 USER_ERRORS = (ValueError, TypeError, OSError, ImportError, NotImplementedError)
-#: Modules with ``main(arguments) -> exit code`` behind ``sb3-rpto benchmark NAME``.
-BENCHMARKS = {
-    "tracing": "sb3_rpto.experiments.tracing_benchmark",
-    "threshold": "sb3_rpto.experiments.threshold",
-    "speed": "sb3_rpto.experiments.speed",
-    "transfer": "sb3_rpto.experiments.sweep",
-    "report": "sb3_rpto.experiments.tables",
-}
 
 Commands = Any  # argparse's own type for a group of subcommands is private
 
@@ -51,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=f"sb3-rpto {__version__}")
     parser.add_argument("--traceback", action="store_true", help="where an error arose, in place of one line")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (train.add, transfer.add, adapt.add, enjoy.add, plot.add, _add_trace, _add_benchmark):
+    for add in (train.add, transfer.add, adapt.add, enjoy.add, plot.add, _add_trace):
         add(commands)
     traceback, shown = False, warnings.formatwarning
     warnings.formatwarning = lambda message, *_: f"sb3-rpto: warning: {message}\n"  # without a line of code
@@ -136,7 +127,8 @@ def _add_trace(commands: Commands) -> None:
 
 
 def _trace(parsed: argparse.Namespace) -> int:
-    from sb3_rpto.tracing import figures, trace
+    from sb3_rpto.sysid import trace
+    from sb3_rpto.sysid.report import figures
 
     # What would fail at the end fails now, before minutes of work.
     figures.require()
@@ -228,25 +220,6 @@ def _progress(quiet: bool) -> Iterator[Callable[[float, str], None] | None]:
     with Progress(*Progress.get_default_columns()[:-1], TimeElapsedColumn(), console=console, transient=True) as bar:
         task = bar.add_task("reading", total=1.0)
         yield lambda share, what: bar.update(task, completed=share, description=what)
-
-
-# --- benchmark ------------------------------------------------------------------------------------------------------
-
-
-def _add_benchmark(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "benchmark",
-        help="measure how well the package does, and make the committed tables",
-        epilog="'sb3-rpto benchmark NAME --help' lists the options of each.",
-    )
-    parser.add_argument("name", metavar="NAME", choices=sorted(BENCHMARKS), help=f"one of: {', '.join(BENCHMARKS)}")
-    parser.add_argument("options", metavar="...", nargs=argparse.REMAINDER, help="passed on to the benchmark")
-    parser.set_defaults(run=_benchmark)
-
-
-def _benchmark(parsed: argparse.Namespace) -> int:
-    module = importlib.import_module(BENCHMARKS[parsed.name])
-    return int(module.main(parsed.options) or 0)
 
 
 if __name__ == "__main__":

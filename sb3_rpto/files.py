@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import hashlib
 import json
 import math
 import os
@@ -175,3 +176,8 @@ def _sweep(file: Path) -> None:
                 return
     if time.time() - file.stat().st_mtime > LEFT:
         file.unlink()
+
+
+def digest(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a file."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()

@@ -14,12 +14,12 @@ import torch as th
 from filelock import FileLock
 from hypothesis import settings
 
+from benchmarks.tracing.planting import Planted, generate
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms import warm_start
 from sb3_rpto.effects import declare
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.experiments.planting import Planted, generate
-from sb3_rpto.tracing import Report, trace
+from sb3_rpto.sysid import Report, trace
 
 th.set_num_threads(1)
 # Machines may be busy: no test is timed.
@@ -47,9 +47,9 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture(autouse=True)
 def _short_source_phase(monkeypatch):
     """The collection for phi_0 takes 25,000 source steps; tests are served by fewer."""
-    monkeypatch.setattr(warm, "PHI_0_STEPS", PHI_0_STEPS)
-    monkeypatch.setattr(warm, "PHI_0_UPDATES", 30)
-    monkeypatch.setattr(warm, "FIRST_SOURCE_STEPS", PHI_0_STEPS)
+    monkeypatch.setattr(warm_start, "PHI_0_STEPS", PHI_0_STEPS)
+    monkeypatch.setattr(warm_start, "PHI_0_UPDATES", 30)
+    monkeypatch.setattr(warm_start, "FIRST_SOURCE_STEPS", PHI_0_STEPS)
 
 
 def pendulum(g: float = 10.0) -> gym.Env:
@@ -81,7 +81,7 @@ def small(cls, env=None, target=None, **kwargs):
 @contextmanager
 def coarsely(step: float = 0.005) -> Iterator[None]:
     """Measured motion is integrated in steps of 2 ms at most; tests are served by longer ones, in s."""
-    with mock.patch("sb3_rpto.tracing.windows.LONGEST", step):
+    with mock.patch("sb3_rpto.sysid.shooting.windows.LONGEST", step):
         yield
 
 

@@ -12,11 +12,12 @@ import mujoco
 import pytest
 from conftest import coarsely
 
+from benchmarks.tracing.planting import generate
 from sb3_rpto import __version__, cli
 from sb3_rpto.commands import recordings
 from sb3_rpto.effects.friction import CoulombFriction
-from sb3_rpto.experiments.planting import generate
-from sb3_rpto.tracing import Measurements, Report, trace, wording
+from sb3_rpto.sysid import Measurements, Report, trace
+from sb3_rpto.sysid.report import descriptions
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,7 @@ def test_options_reach_the_trace(files: Path, monkeypatch: pytest.MonkeyPatch) -
         asked.update(kwargs)
         raise ValueError("enough")
 
-    monkeypatch.setattr("sb3_rpto.tracing.trace", stop)
+    monkeypatch.setattr("sb3_rpto.sysid.trace", stop)
     options = ["--calibrate", "7", "--horizon", "0.2", "--threads", "1", "--seed", "4", "--quiet"]
     assert run(files, *options) == 2
     expected = {"calibrate": 7, "horizon": 0.2, "threads": 1, "seed": 4, "candidates": ["coulomb_friction"]}
@@ -99,7 +100,7 @@ def test_columns_that_files_call_otherwise_are_renamed(
     header, rows = (files / "runs.csv").read_text().split("\n", 1)
     (files / "own.csv").write_text(f"# {header.replace('time', 't').replace('qpos.hinge', 'q1')}\n{rows}")
     read: list[Measurements] = []
-    monkeypatch.setattr("sb3_rpto.tracing.trace", lambda model, data, *_, **__: read.append(data) or sys.exit(7))
+    monkeypatch.setattr("sb3_rpto.sysid.trace", lambda model, data, *_, **__: read.append(data) or sys.exit(7))
     with pytest.raises(SystemExit):
         run(files, "--rename", "t=time", "--rename", "q1=qpos.hinge", data="own.csv")
     assert recordings.digest(read[0]) == recordings.digest(Measurements.from_csv(files / "runs.csv"))
@@ -134,7 +135,7 @@ def test_bad_input_leaves_no_folder(files: Path, tmp_path: Path) -> None:
 def test_quiet_prints_the_verdict_alone(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(files, "--quiet", "--format", "csv", "--horizon", "0.15") == 0
     captured = capsys.readouterr()
-    assert captured.out.strip() in wording.VERDICTS
+    assert captured.out.strip() in descriptions.VERDICTS
     assert captured.err == ""
 
 
@@ -225,8 +226,8 @@ def refuse(*_: object) -> None:
 def test_a_model_that_cannot_be_saved_fails_before_the_work(
     files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sb3_rpto.effects.carry.write_mjcf", refuse)
-    monkeypatch.setattr("sb3_rpto.tracing.trace", lambda *_, **__: pytest.fail("it was started"))
+    monkeypatch.setattr("sb3_rpto.effects.corrected_model_io.write_mjcf", refuse)
+    monkeypatch.setattr("sb3_rpto.sysid.trace", lambda *_, **__: pytest.fail("it was started"))
     assert run(files) == 2
     assert "tip.obj is gone" in error(capsys)
 
@@ -235,8 +236,8 @@ def test_a_model_that_cannot_be_saved_fails_before_the_work(
 def test_the_report_is_written_where_the_model_cannot_be(
     files: Path, found: Report, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sb3_rpto.tracing.trace", lambda *_, **__: found)
-    monkeypatch.setattr("sb3_rpto.tracing.report.save_corrected", refuse)
+    monkeypatch.setattr("sb3_rpto.sysid.trace", lambda *_, **__: found)
+    monkeypatch.setattr("sb3_rpto.sysid.report.report.save_corrected", refuse)
     assert run(files, "--out", str(tmp_path / "new")) == 2
     captured = capsys.readouterr()
     assert captured.out.startswith("verdict: ")
@@ -248,7 +249,7 @@ def test_the_report_is_written_where_the_model_cannot_be(
 def test_what_a_terminal_cannot_show_keeps_nothing_from_being_written(
     files: Path, found: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sb3_rpto.tracing.trace", lambda *_, **__: found)
+    monkeypatch.setattr("sb3_rpto.sysid.trace", lambda *_, **__: found)
     stdout = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", stdout)
     assert run(files, "--out", str(tmp_path / "plain")) == 0

@@ -18,11 +18,11 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto import RPTO
-from sb3_rpto.algorithms import closing, renewal
+from sb3_rpto.algorithms.closed_loop import controller, source_buffer
 from sb3_rpto.callbacks import RelativityGapCallback
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
 from sb3_rpto.effects import LIBRARY, Parameter, declare, parameter_names
-from sb3_rpto.effects.carry import carried_by
+from sb3_rpto.effects.corrected_model_io import carried_by
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.presets import preset_names, resolve_preset
 
@@ -123,8 +123,8 @@ def test_every_logged_key_is_explained_and_every_explained_key_is_logged(monkeyp
     physical = {"dynamics": "physical", "declared": ["pole_length", "gravity"], "policy_kwargs": SMALL_POLICY}
     model = RPTO("MlpPolicy", cartpole, target_env=gym.make(cartpole, pole_length=2.0), gradient_steps=1, **physical)
     keys |= logged(model)
-    monkeypatch.setattr(closing, "FIRST", 80)
-    monkeypatch.setattr(renewal, "FILL", 25)
+    monkeypatch.setattr(controller, "FIRST", 80)
+    monkeypatch.setattr(source_buffer, "FILL", 25)
     double = "InvertedDoublePendulum-v5"
     target = apply_effects(gym.make(double), [LIBRARY["coulomb_friction"]("slider", level=5.0)])
     settings = {

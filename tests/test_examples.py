@@ -11,9 +11,10 @@ import pandas as pd
 import pytest
 from stable_baselines3 import SAC
 
-from sb3_rpto.algorithms import closing
-from sb3_rpto.effects.carry import load_corrected
-from sb3_rpto.tracing import Measurements, windows
+from sb3_rpto.algorithms.closed_loop import controller
+from sb3_rpto.effects.corrected_model_io import load_corrected
+from sb3_rpto.sysid import Measurements
+from sb3_rpto.sysid.shooting import windows
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SMALL = ["--episodes", "6", "--duration", "2.5"]
@@ -90,7 +91,7 @@ def test_trace_robot_draws_by_seed(trace_robot):
 def test_robot_log_to_policy_goes_from_a_log_to_a_policy(monkeypatch, tmp_path, capsys):
     example = load("robot_log_to_policy", monkeypatch)
     monkeypatch.setattr(windows, "LONGEST", 0.005)
-    monkeypatch.setattr(importlib.import_module("sb3_rpto.tracing.prepare"), "FEW", 12)
+    monkeypatch.setattr(importlib.import_module("sb3_rpto.sysid.problem.prepare"), "FEW", 12)
     monkeypatch.setattr(sys, "argv", ["robot_log_to_policy.py", "--quick", "--out", str(tmp_path)])
     example.main()
     header = "time,qpos.slider,qpos.hinge,qpos.hinge2,qvel.slider,qvel.hinge,qvel.hinge2,ctrl.slide"
@@ -121,8 +122,8 @@ def test_close_the_loop_names_what_is_in_the_target(monkeypatch, tmp_path, capsy
     agent = SAC("MlpPolicy", transfer.source(), seed=0, device="cpu", **small).learn(300)
     agent.save(tmp_path / "source_0.zip")
     agent.save_replay_buffer(tmp_path / "source_0_data.pkl")
-    trace = closing.trace
-    monkeypatch.setattr(closing, "trace", lambda *a, **k: trace(*a, **{**k, "candidates": ["coulomb_friction"]}))
+    trace = controller.trace
+    monkeypatch.setattr(controller, "trace", lambda *a, **k: trace(*a, **{**k, "candidates": ["coulomb_friction"]}))
     few = ["--steps", "202", "--retrain-steps", "25"]
     monkeypatch.setattr(sys, "argv", ["close_the_loop.py", *few, "--out", str(tmp_path)])
     example.main()

@@ -21,9 +21,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_rpto import RPO, RPTO
-from sb3_rpto.algorithms.answers import NotFiniteError
+from sb3_rpto.algorithms.transition_checks import NotFiniteError
+from sb3_rpto.baselines.registry import REGISTRY
 from sb3_rpto.envs import tasks
-from sb3_rpto.experiments.methods import REGISTRY
 from sb3_rpto.presets import preset_names, resolve_preset
 from sb3_rpto.zoo import enjoy, train
 from sb3_rpto.zoo.samplers import SAMPLERS, convert

@@ -14,14 +14,14 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_rpto.algorithms import settings
-from sb3_rpto.algorithms.bookkeeping import TwoWorlds
+from sb3_rpto.algorithms import argument_ranges
+from sb3_rpto.algorithms.two_env_sac import TwoWorlds
 from sb3_rpto.effects import Declared, Effect
 from sb3_rpto.effects.names import near
 from sb3_rpto.ranges import check
 
 if TYPE_CHECKING:
-    from sb3_rpto.algorithms.closing import LoopCloser
+    from sb3_rpto.algorithms.closed_loop.controller import LoopCloser
 
 #: Arguments that only an algorithm with trainable dynamics has a use for.
 DYNAMICS_ARGUMENTS = frozenset(
@@ -179,7 +179,7 @@ def check_values_of(model: TwoWorlds) -> None:
 
     :raises ValueError: naming the argument and what it must be
     """
-    rules = {**settings.OF_SAC, **settings.OURS}
+    rules = {**argument_ranges.OF_SAC, **argument_ranges.OURS}
     check(rules, {**vars(model), "dynamics": model.dynamics_backend, "policy": model.policy_class})
 
 
@@ -215,7 +215,9 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
 
     :raises ValueError: naming what is missing or wrong
     """
-    check(settings.OF_LEARN, {"total_timesteps": total_timesteps, "source_timesteps": source_timesteps, **others})
+    check(
+        argument_ranges.OF_LEARN, {"total_timesteps": total_timesteps, "source_timesteps": source_timesteps, **others}
+    )
     if model.env is None:
         raise ValueError("learn() needs the source environment: pass env= to load(), or call set_env()")
     if model.env.env_is_wrapped(Monitor)[0] and not model.env.get_attr("allow_early_resets", indices=[0])[0]:

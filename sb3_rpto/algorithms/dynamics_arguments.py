@@ -16,7 +16,7 @@ from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.names import near
 from sb3_rpto.envs.corrected import check_carries
 from sb3_rpto.envs.observations import single_env
-from sb3_rpto.envs.rules import misfit
+from sb3_rpto.envs.task_rules import misfit
 
 
 def check_kinds(close_loop: bool | Sequence[str]) -> None:

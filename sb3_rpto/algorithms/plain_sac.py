@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.save_util import load_from_zip_file
 
-from sb3_rpto.algorithms import zips
+from sb3_rpto.algorithms import model_zip
 
 #: Constructor arguments that a warm start takes over from the source model, unless the user passes them.
 CARRIED = (
@@ -60,9 +60,9 @@ def sac_of_weights(path: Any, env: Any, policy_kwargs: Mapping[str, Any] | None,
     """
     if not isinstance(path, str | os.PathLike):
         raise TypeError(f"source_model must be the path of a zip where weights_only=True, not {type(path).__name__}")
-    file = zips.located(path, "source_model")
-    content = zips.look_into(file, "source_model")
-    misfit = zips.misfit_of_sac(content)
+    file = model_zip.located(path, "source_model")
+    content = model_zip.look_into(file, "source_model")
+    misfit = model_zip.misfit_of_sac(content)
     if misfit:
         raise ValueError(f"source_model={str(path)!r} is not the zip of a SAC ({misfit})")
     settings = {name: content[name] for name in CARRIED if isinstance(content.get(name), bool | int | float | str)}

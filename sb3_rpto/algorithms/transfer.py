@@ -17,22 +17,30 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_rpto.algorithms import arguments, dynamics_arguments, normalisation, plain_sac, resuming, settings, warm
-from sb3_rpto.algorithms.bookkeeping import DYNAMICS_SEED_OFFSET
-from sb3_rpto.algorithms.closing import LoopCloser, trace_log
-from sb3_rpto.algorithms.listeners import check_callbacks
-from sb3_rpto.algorithms.looping import Looping
-from sb3_rpto.algorithms.remembered import doubt_returns
-from sb3_rpto.algorithms.source import RolloutStart, SourceWorld, make_source_world, try_source
-from sb3_rpto.algorithms.worlds import check_environment, check_spaces, find_ledger
+from sb3_rpto.algorithms import (
+    argument_ranges,
+    arguments,
+    dynamics_arguments,
+    normalisation,
+    plain_sac,
+    run_state,
+    warm_start,
+)
+from sb3_rpto.algorithms.callback_adapters import check_callbacks
+from sb3_rpto.algorithms.closed_loop.controller import LoopCloser, trace_log
+from sb3_rpto.algorithms.closed_loop.looping import Looping
+from sb3_rpto.algorithms.rollouts import RolloutStart, SourceWorld, make_source_world, try_source
+from sb3_rpto.algorithms.target import check_environment, check_spaces, find_ledger
+from sb3_rpto.algorithms.two_env_sac import DYNAMICS_SEED_OFFSET
+from sb3_rpto.algorithms.validation import doubt_returns
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics, preset_section
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.weights import WeightingName
-from sb3_rpto.envs.rules import env_id
+from sb3_rpto.envs.task_rules import env_id
 from sb3_rpto.presets import resolve_preset
-from sb3_rpto.tracing import Measurements
+from sb3_rpto.sysid import Measurements
 
 Self = TypeVar("Self", bound="TransferAlgorithm")
 
@@ -42,19 +50,20 @@ class TransferAlgorithm(Looping):
 
     Here are the constructor and the loop of Algorithm 1 with steps 3 and 4. What it stands on, from SAC up: the updates
     of steps 5 and 6 (:class:`~sb3_rpto.algorithms.update.RelativeUpdate`), policies to go back to
-    (:class:`~sb3_rpto.algorithms.snapshots.PolicySnapshots`), the two environments and SB3's accounts of them
-    (:class:`~sb3_rpto.algorithms.bookkeeping.TwoWorlds`), files (:class:`~sb3_rpto.algorithms.checkpoint.Resumable`),
-    and the closed loop's part (:class:`~sb3_rpto.algorithms.looping.Looping`).
+    (:class:`~sb3_rpto.algorithms.policy_snapshots.PolicySnapshots`), the two environments and SB3's accounts of them
+    (:class:`~sb3_rpto.algorithms.two_env_sac.TwoWorlds`), files
+    (:class:`~sb3_rpto.algorithms.checkpointing.Resumable`), and the closed loop's part
+    (:class:`~sb3_rpto.algorithms.closed_loop.looping.Looping`).
 
     The arguments up to ``device`` are SAC's, with SAC's defaults, except that ``gradient_steps`` counts updates per
     TARGET step and ``learning_starts`` applies to the source alone (no random action is ever taken in the target).
 
     :param target_env: the scarce world, an environment, a VecEnv or an id; ``learn()`` needs it or ``target_data``
     :param target_data: the target recorded beforehand, in place of ``target_env`` (RTO and RPTO): transitions (a replay
-        buffer, its pickle or an ``.npz``), or :class:`~sb3_rpto.tracing.Measurements` of a robot, on the joints and
+        buffer, its pickle or an ``.npz``), or :class:`~sb3_rpto.sysid.Measurements` of a robot, on the joints and
         actuators of ``env``'s MuJoCo model. D_target then holds the steps that ``env`` would have taken there
-        (:func:`~sb3_rpto.algorithms.recorded.transitions`), and with ``dynamics="physical"`` phi comes from one
-        :func:`~sb3_rpto.tracing.trace` of the recordings, at the start of ``learn()``, in place of one-step fits
+        (:func:`~sb3_rpto.algorithms.offline_target.transitions`), and with ``dynamics="physical"`` phi comes from one
+        :func:`~sb3_rpto.sysid.trace` of the recordings, at the start of ``learn()``, in place of one-step fits
     :param preset: hyperparameters for what is not passed: "default", "paper" or "author"
     :param dynamics: backend of the trainable source: "ensemble" (networks), "physical" (a simulator with trainable
         numbers) or "residual" (that simulator and a small ensemble on what it still misses)
@@ -141,7 +150,7 @@ class TransferAlgorithm(Looping):
         model_train_freq: int = 250,
     ) -> None:
         self._passed |= arguments.set_among(TransferAlgorithm.__init__, locals())  # by a subclass's __init__, too
-        settings.check_given(locals())
+        argument_ranges.check_given(locals())
         if isinstance(env, str):
             env = gym.make(env)
         if env is not None:  # SB3's load() builds the object before it has an env
@@ -243,7 +252,7 @@ class TransferAlgorithm(Looping):
                 self._traces_log = True
                 self.loop = self.loop or LoopCloser(self.declared, kinds=False)
             if target_data is not None:
-                warm.fill_target(self, target_data)
+                warm_start.fill_target(self, target_data)
                 self._since_fit = self.model_train_freq  # all data are there: the first fit need not wait
 
     # ------------------------------------------------------------------ setting up
@@ -323,22 +332,22 @@ class TransferAlgorithm(Looping):
         if isinstance(env, str):
             env = gym.make(env)
         check_environment(env, "env")
-        settings.check_given(kwargs)
+        argument_ranges.check_given(kwargs)
         device = kwargs.get("device", "auto")
         if weights_only:
             sac = plain_sac.sac_of_weights(source_model, env, kwargs.get("policy_kwargs"), device)
         else:
-            sac = warm.load_sac(source_model, device)
-        warm.check_source_spaces(sac, env)
+            sac = warm_start.load_sac(source_model, device)
+        warm_start.check_source_spaces(sac, env)
         env, statistics = normalisation.as_learned(sac, source_model, env, vec_normalize, unpickle=not weights_only)
         given = {**plain_sac.carried_arguments(sac), **kwargs}
         model = cls(cast(type[SACPolicy], sac.policy_class), env, target_env=target_env, **given)
         # "auto" asks for a learned temperature, a number or "auto_0.5" for that one.
-        warm.carry_over(sac, model, temperature=kwargs.get("ent_coef", "auto") == "auto")
+        warm_start.carry_over(sac, model, temperature=kwargs.get("ent_coef", "auto") == "auto")
         if not normalisation.check_source_model(sac, statistics, model.get_vec_normalize_env()):
             doubt_returns(sac, env)
         if source_data is not None:
-            warm.fill_source(model, source_data)
+            warm_start.fill_source(model, source_data)
         return model
 
     # ------------------------------------------------------------------ Algorithm 1
@@ -383,8 +392,8 @@ class TransferAlgorithm(Looping):
             arguments.warn_of_idle_source_phase(self, source_timesteps)
         self._store_step_cut_off()
         if reset_num_timesteps and self._warm:  # else the source phase goes on all the same
-            resuming.leave(self)
-        resuming.resume_unbegun(self)
+            run_state.leave(self)
+        run_state.resume_unbegun(self)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
@@ -392,9 +401,9 @@ class TransferAlgorithm(Looping):
         self._source_world = self._source_world or self._make_source_world()
         trace_log(self)  # first of all: the log may be refused
         if not self._warm:
-            resuming.resume_source_phase(self)
+            run_state.resume_source_phase(self)
         self.begin_in_source(source_timesteps, progress_bar)
-        resuming.resume(self)
+        run_state.resume(self)
         if self.loop is not None:
             self.loop.begin(self)
         self._watch_for_null_shift()
@@ -435,7 +444,7 @@ class TransferAlgorithm(Looping):
         :param source_timesteps: source steps that train a model which knows nothing of the source
         :param progress_bar: show a bar for them
         """
-        warm.begin_in_source(self, source_timesteps, progress_bar)
+        warm_start.begin_in_source(self, source_timesteps, progress_bar)
 
     def interact_with_source(self) -> None:
         """Step 3: act in the source P_phi, ``source_steps`` times for each target step, and fill D_source."""

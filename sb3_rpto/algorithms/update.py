@@ -15,12 +15,12 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.sac.policies import SACPolicy
 from torch.nn import functional as F
 
-from sb3_rpto.algorithms.descent import Descent, Follower
-from sb3_rpto.algorithms.forward import sample_actions, smallest_q
-from sb3_rpto.algorithms.written import WrittenUpdate, are_usual
+from sb3_rpto.algorithms.fast_forward import sample_actions, smallest_q
+from sb3_rpto.algorithms.fast_update import WrittenUpdate, are_usual
+from sb3_rpto.algorithms.fused_optimizer import Descent, Follower
 from sb3_rpto.buffers import DualReplayBuffer, World, chronological
 from sb3_rpto.dynamics.base import Dynamics, Transitions
-from sb3_rpto.dynamics.products import fast_products
+from sb3_rpto.dynamics.matmul_precision import fast_products
 from sb3_rpto.dynamics.weights import WeightingName, effective_sample_size, rto_weights
 
 #: The actor's batches alternate: four from D_target, then one from D_source (f = 5 in the paper's appendix).

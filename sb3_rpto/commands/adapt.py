@@ -60,9 +60,8 @@ def run(parsed: argparse.Namespace) -> int:
     from sb3_rpto.commands.runs import RunFolder, beside, load_checkpoint, statistics_asked
     from sb3_rpto.commands.terminal import lines, say
     from sb3_rpto.effects import Declared
-    from sb3_rpto.experiments.sources import digest
-    from sb3_rpto.files import write_atomically
-    from sb3_rpto.tracing import figures
+    from sb3_rpto.files import digest, write_atomically
+    from sb3_rpto.sysid.report import figures
 
     figures.require()
     options.check_positive(parsed, "steps")

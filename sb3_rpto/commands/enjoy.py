@@ -46,7 +46,7 @@ class Corrected(options.World):
 
     def make(self, **more: Any) -> gym.Env:
         """The corrected environment."""
-        from sb3_rpto.effects.carry import read_effects
+        from sb3_rpto.effects.corrected_model_io import read_effects
         from sb3_rpto.effects.stance import StandingEnv
 
         env = super().make(**more)
@@ -193,7 +193,7 @@ def _agent_of(folder: Path, known: dict[str, Any]) -> str | None:
     :raises FileNotFoundError: it is there no longer
     :raises ValueError: another is in its place
     """
-    from sb3_rpto.experiments.sources import digest
+    from sb3_rpto.files import digest
 
     agent = known.get("source_model")
     if agent is None:

@@ -72,7 +72,7 @@ def device(text: str) -> str:
 
     :raises argparse.ArgumentTypeError: for a name that torch does not know, and a GPU that is not there
     """
-    from sb3_rpto.algorithms.settings import check_device
+    from sb3_rpto.algorithms.argument_ranges import check_device
 
     try:
         check_device(text)
@@ -162,7 +162,7 @@ def check_sac(settings: dict[str, Any]) -> None:
     """
     from stable_baselines3 import SAC
 
-    from sb3_rpto.algorithms.settings import OF_SAC
+    from sb3_rpto.algorithms.argument_ranges import OF_SAC
     from sb3_rpto.ranges import check
 
     own = {name: p.default for name, p in inspect.signature(SAC).parameters.items()} | settings

@@ -173,7 +173,7 @@ def draw(axes: Any, rows: pd.DataFrame, title: str) -> None:
     :param rows: columns method, run, seed, steps, return
     :param title: of the panel
     """
-    from sb3_rpto.experiments.report import summarise
+    from sb3_rpto.evaluation.statistics import summarise
 
     for method, own in rows.groupby("method", sort=True):
         lines = summarise(_at_same_steps(own), ["steps"])

@@ -12,10 +12,10 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_rpto.algorithms import zips
+from sb3_rpto.algorithms import model_zip
 from sb3_rpto.algorithms.normalisation import in_statistics, read_statistics, statistics_beside
-from sb3_rpto.algorithms.slbo import SLBO
-from sb3_rpto.algorithms.warm import load_sac
+from sb3_rpto.algorithms.warm_start import load_sac
+from sb3_rpto.baselines.slbo import SLBO
 from sb3_rpto.commands import options
 from sb3_rpto.files import write_atomically
 
@@ -79,7 +79,7 @@ def load_policy(path: str | Path, argument: str, statistics: str | Path | None =
 
 
 def _load(path: str | Path, argument: str) -> Policy:
-    zips.look_into(path, argument)
+    model_zip.look_into(path, argument)
     constant = {"lr_schedule": lambda _: 0.0, "learning_rate": 0.0}
     data, parameters, _ = load_from_zip_file(path, device="cpu", custom_objects=constant)
     assert data is not None  # it was looked into

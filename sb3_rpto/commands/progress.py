@@ -15,7 +15,7 @@ from sb3_rpto.commands.terminal import say
 from sb3_rpto.files import write_text
 
 if TYPE_CHECKING:
-    from sb3_rpto.algorithms.closing import LoopCloser
+    from sb3_rpto.algorithms.closed_loop.controller import LoopCloser
 
 #: Rows of a run; a checkpoint with each but the last.
 COUNT = 8

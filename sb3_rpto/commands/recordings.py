@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from sb3_rpto.effects import Effect
     from sb3_rpto.effects.model import ModelSource
-    from sb3_rpto.tracing import Measurements
+    from sb3_rpto.sysid import Measurements
 
 #: Readers of recordings by the suffix of their files.
 FORMATS = {"csv": "from_csv", "parquet": "from_parquet", "npz": "from_npz"}
@@ -56,7 +56,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def _rename(text: str) -> dict[str, str]:
-    from sb3_rpto.tracing.tables import parse_rename
+    from sb3_rpto.sysid.data.text_tables import parse_rename
 
     try:
         return parse_rename(text)
@@ -85,7 +85,7 @@ def check_out(out: Path, model: ModelSource) -> None:
     :param model: the nominal one
     :raises ValueError: nothing tells its MJCF, or it is in ``out`` itself
     """
-    from sb3_rpto.effects.carry import check_free, save_corrected
+    from sb3_rpto.effects.corrected_model_io import check_free, save_corrected
     from sb3_rpto.effects.model import file_of
 
     try:
@@ -105,7 +105,7 @@ def known(path: Path | None, model: ModelSource) -> list[Effect]:
     :raises ValueError: it holds something else, or an effect that the model cannot have
     """
     from sb3_rpto.commands.options import check_file
-    from sb3_rpto.effects.carry import read_effects
+    from sb3_rpto.effects.corrected_model_io import read_effects
     from sb3_rpto.effects.model import load_model
 
     check_file(path, "--known")
@@ -120,7 +120,7 @@ def read(files: Sequence[str], form: str | None, rename: Sequence[Mapping[str, s
     :param rename: names of columns by those of the files
     :raises ValueError: of several formats, or an unknown one; a name that the files do not have, or that is given twice
     """
-    from sb3_rpto.tracing import Measurements
+    from sb3_rpto.sysid import Measurements
 
     found = {form} if form else {_format_of(file) for file in files}
     if len(found) > 1:

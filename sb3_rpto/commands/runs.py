@@ -19,12 +19,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.commands.policies import STATISTICS, save_statistics
 from sb3_rpto.commands.terminal import lines
-from sb3_rpto.experiments.curve import LearningCurve, MakeEnv
-from sb3_rpto.experiments.sources import digest
-from sb3_rpto.files import plain, write_json, write_text
+from sb3_rpto.evaluation.learning_curve import LearningCurve, MakeEnv
+from sb3_rpto.files import digest, plain, write_json, write_text
 
 if TYPE_CHECKING:
-    from sb3_rpto.tracing import Report
+    from sb3_rpto.sysid import Report
 
 #: In a checkpoint: the class of its model, and the rows until then.
 CURVE = "curve.json"
@@ -196,7 +195,7 @@ class SavedCurve(LearningCurve):
     :param total: steps of the run; after the last there is no checkpoint
     :param n_episodes: of an evaluation
     :param seed: of the evaluation's initial states
-    :param after_update: as that of :class:`~sb3_rpto.experiments.curve.LearningCurve`
+    :param after_update: as that of :class:`~sb3_rpto.evaluation.learning_curve.LearningCurve`
     :param until: return at which the run ends early
     :param resumable: whether to leave checkpoints
     :param say: told of each row in a line

@@ -12,8 +12,8 @@ from sb3_rpto.commands import options, recordings
 from sb3_rpto.commands.terminal import say
 
 if TYPE_CHECKING:
+    from sb3_rpto.baselines.registry import Run
     from sb3_rpto.commands.runs import SavedCurve
-    from sb3_rpto.experiments.methods import Run
 
 DESCRIPTION = """\
 Move a source agent to a target, and draw its learning curve there.
@@ -70,12 +70,11 @@ def add(commands: Any) -> None:
 
 def run(parsed: argparse.Namespace) -> int:
     """Transfer, or go on with it."""
+    from sb3_rpto.baselines.registry import REGISTRY, Run
     from sb3_rpto.commands.policies import save_statistics, say_statistics, statistics_of_source
     from sb3_rpto.commands.runs import RunFolder, SavedCurve, beside, statistics_asked
-    from sb3_rpto.experiments.methods import REGISTRY, Run
-    from sb3_rpto.experiments.sources import digest
-    from sb3_rpto.files import write_atomically
-    from sb3_rpto.tracing import figures
+    from sb3_rpto.files import digest, write_atomically
+    from sb3_rpto.sysid.report import figures
     from sb3_rpto.zoo.settings import ALGORITHMS, shipped_settings
 
     options.check_positive(parsed, "steps", "every", "episodes")
@@ -180,7 +179,7 @@ def _check_settings(method: str, settings: dict[str, Any], steps: int) -> None:
 
     :raises ValueError: naming the argument
     """
-    from sb3_rpto.experiments.baselines import check_step_by_step
+    from sb3_rpto.baselines.sac_variants import check_step_by_step
 
     options.check_names(settings, _known_settings(method))
     if method == "sysid-retrain" and not settings.get("declared"):
@@ -208,9 +207,9 @@ def _check_worlds(
 
     :raises ValueError: naming the argument
     """
-    from sb3_rpto.algorithms.warm import load_sac
+    from sb3_rpto.algorithms.warm_start import load_sac
+    from sb3_rpto.baselines.registry import REGISTRY
     from sb3_rpto.buffers import load_transitions
-    from sb3_rpto.experiments.methods import REGISTRY
     from sb3_rpto.zoo.settings import ALGORITHMS
 
     sac = load_sac(parsed.source_model, "cpu")
@@ -249,7 +248,7 @@ def _doubt_agent(sac: Any, source: options.World, statistics: str | Literal[Fals
     from stable_baselines3.common.vec_env import VecNormalize
 
     from sb3_rpto.algorithms.normalisation import check_source_model, in_statistics
-    from sb3_rpto.algorithms.remembered import doubt_returns
+    from sb3_rpto.algorithms.validation import doubt_returns
 
     env: Any = source.make()
     if statistics:

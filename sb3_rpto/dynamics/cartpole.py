@@ -16,7 +16,7 @@ from torch import nn
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
 from sb3_rpto.effects.names import near
 from sb3_rpto.envs.cartpole import CartPoleParameters, cartpole_reward, cartpole_step, cartpole_termination
-from sb3_rpto.envs.rules import changing_wrappers
+from sb3_rpto.envs.task_rules import changing_wrappers
 from sb3_rpto.ranges import MAPPING, NONE, POSITIVE, check, whole
 
 #: The constants that may be declared, with their default bounds; None is a tenth to ten times the nominal value.

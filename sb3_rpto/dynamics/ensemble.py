@@ -14,8 +14,8 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
+from sb3_rpto.dynamics.matmul_precision import fast_products, no_denormals
 from sb3_rpto.dynamics.networks import Heads, StackedNetworks
-from sb3_rpto.dynamics.products import fast_products, no_denormals
 from sb3_rpto.ranges import FLAG, POSITIVE, WIDTHS, Rule, check, number, whole
 
 #: a known rule of the task, in torch: (observations, actions, next_observations) -> (n,)

@@ -14,7 +14,7 @@ from sb3_rpto.dynamics.ensemble import EnsembleDynamics
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.simulator import physical_config
-from sb3_rpto.envs.rules import task_rules
+from sb3_rpto.envs.task_rules import task_rules
 
 BACKENDS = ("ensemble", "physical", "residual")
 

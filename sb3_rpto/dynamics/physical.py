@@ -25,9 +25,9 @@ from sb3_rpto.effects.model import ModelSource, load_model
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
-from sb3_rpto.envs.copies import copy_env
+from sb3_rpto.envs.env_copy import copy_env
 from sb3_rpto.envs.observations import StateMap, are_known, env_name, noise_of_each, single_env, whole_state
-from sb3_rpto.envs.steps import place_as_after_a_step
+from sb3_rpto.envs.step_fidelity import place_as_after_a_step
 from sb3_rpto.ranges import NOT_NEGATIVE, POSITIVE, THREADS, check, of_type, whole
 
 #: What the constructor's arguments may be.

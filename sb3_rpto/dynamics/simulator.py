@@ -21,7 +21,7 @@ from sb3_rpto.envs.observations import (
     state_map,
     strange_wrapper,
 )
-from sb3_rpto.envs.steps import drawn_numbers, draws_unseeded, odd_memory, odd_state, odd_step
+from sb3_rpto.envs.step_fidelity import drawn_numbers, draws_unseeded, odd_memory, odd_state, odd_step
 
 
 def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:

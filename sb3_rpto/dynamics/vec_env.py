@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.env import check_dynamics, predict, time_limit
-from sb3_rpto.envs.state import restore_state, save_state
+from sb3_rpto.envs.env_snapshot import restore_state, save_state
 
 
 class DynamicsVecEnv(VecEnv):

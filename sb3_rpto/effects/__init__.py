@@ -1,6 +1,13 @@
 """The physics that a world may contain: what shifts a target, is planted in a test, or corrects a model."""
 
-from sb3_rpto.effects import bodies, commands, forces, friction, held, sensors  # noqa: F401  (they register their effects)
+from sb3_rpto.effects import (  # noqa: F401  (they register their effects)
+    bodies,
+    commands,
+    forces,
+    friction,
+    sensors,
+    zero_order_hold,
+)
 from sb3_rpto.effects.declared import Declared, declare, parameter_names
 from sb3_rpto.effects.effect import LIBRARY, Effect, Parameter, Scales, from_json, register
 from sb3_rpto.effects.library import candidates

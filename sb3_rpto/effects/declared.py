@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects.effect import Effect, Parameter, Scales
+from sb3_rpto.effects.model_parameters import NUMBERS, OPTIONS, Number
 from sb3_rpto.effects.names import SCALAR_JOINTS, near, object_id, object_names
-from sb3_rpto.effects.numbers import NUMBERS, OPTIONS, Number
 from sb3_rpto.effects.world import World
 
 OBJECTS = ("joint", "body", "geom", "actuator")

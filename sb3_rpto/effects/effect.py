@@ -319,7 +319,7 @@ LIBRARY: dict[str, type[Effect]] = {}
 
 
 def register(effect: type[Effect]) -> type[Effect]:
-    """Class decorator: add an effect to the library, so that :func:`sb3_rpto.tracing.trace` looks for it.
+    """Class decorator: add an effect to the library, so that :func:`sb3_rpto.sysid.trace` looks for it.
 
     :raises ValueError: the class lacks an attribute, one does not fit, it overrides no hook, or another effect has its
         kind

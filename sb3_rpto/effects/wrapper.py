@@ -73,7 +73,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
     :raises ValueError: no MuJoCo environment; an effect on an object not in the model
     """
 
-    #: what changes after it is made, for :func:`sb3_rpto.envs.state.save_state`
+    #: what changes after it is made, for :func:`sb3_rpto.envs.env_snapshot.save_state`
     state_attributes: ClassVar[tuple[str, ...]] = ("_memory", "_past", "_time")
 
     def __init__(self, env: gym.Env, effects: Sequence[Effect]) -> None:

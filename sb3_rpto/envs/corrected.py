@@ -7,7 +7,7 @@ import gymnasium as gym
 from sb3_rpto.effects.effect import LIBRARY, Effect
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
-from sb3_rpto.envs.copies import copy_env
+from sb3_rpto.envs.env_copy import copy_env
 
 
 def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:

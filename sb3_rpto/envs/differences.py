@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
-from sb3_rpto.envs.copies import copy_env
+from sb3_rpto.envs.env_copy import copy_env
 
 #: What tasks keep beside the model that decides on resets and ends.
 _TASK = ("init_qpos", "init_qvel", "_healthy_z_range", "_healthy_angle_range", "_healthy_state_range")

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
-from sb3_rpto.envs.rules import HARMLESS_VEC_WRAPPERS, HARMLESS_WRAPPERS
+from sb3_rpto.envs.task_rules import HARMLESS_VEC_WRAPPERS, HARMLESS_WRAPPERS
 
 CLIP = 10.0
 """Speeds are observed up to this bound by Hopper, Walker2d and InvertedDoublePendulum, in m/s or rad/s."""

@@ -12,8 +12,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
-from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.differences import Difference, differs
+from sb3_rpto.envs.env_copy import copy_env
 
 if TYPE_CHECKING:  # MuJoCo is needed for MuJoCo's tasks alone
     from sb3_rpto.effects import Effect

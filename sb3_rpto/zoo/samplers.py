@@ -6,11 +6,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from sb3_rpto.algorithms.mbpo import MBPO
-from sb3_rpto.algorithms.pdml import PDML
-from sb3_rpto.algorithms.ptp import PTP
-from sb3_rpto.algorithms.slbo import SLBO
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
+from sb3_rpto.baselines.mbpo import MBPO
+from sb3_rpto.baselines.pdml import PDML
+from sb3_rpto.baselines.ptp import PTP
+from sb3_rpto.baselines.slbo import SLBO
 from sb3_rpto.zoo.settings import ALGORITHMS
 
 if TYPE_CHECKING:

@@ -11,11 +11,11 @@ import gymnasium as gym
 import yaml
 
 from sb3_rpto.algorithms import RPO, RPTO, RTO
-from sb3_rpto.algorithms.mbpo import MBPO
-from sb3_rpto.algorithms.pdml import PDML
-from sb3_rpto.algorithms.ptp import PTP
-from sb3_rpto.algorithms.slbo import SLBO
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
+from sb3_rpto.baselines.mbpo import MBPO
+from sb3_rpto.baselines.pdml import PDML
+from sb3_rpto.baselines.ptp import PTP
+from sb3_rpto.baselines.slbo import SLBO
 from sb3_rpto.envs import tasks
 
 #: The algorithms that the launcher adds to those of the zoo, by the names of ``--algo``.

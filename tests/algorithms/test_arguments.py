@@ -18,7 +18,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms import arguments, settings
+from sb3_rpto.algorithms import argument_ranges, arguments
 from sb3_rpto.effects import LIBRARY, declare
 
 
@@ -39,7 +39,7 @@ def test_actions_that_are_not_flat_are_refused_at_construction(cls):
 
 
 def test_what_is_allowed_passes():
-    settings.check_given(
+    argument_ranges.check_given(
         {
             **{
                 "policy": "MlpPolicy",

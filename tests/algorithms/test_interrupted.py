@@ -5,10 +5,10 @@ from conftest import SMALL_ENSEMBLE, pendulum, small
 from stable_baselines3 import SAC
 
 from sb3_rpto import RPTO, RTO
-from sb3_rpto.algorithms.mbpo import MBPO
-from sb3_rpto.algorithms.pdml import PDML
-from sb3_rpto.algorithms.ptp import PTP
-from sb3_rpto.algorithms.slbo import SLBO
+from sb3_rpto.baselines.mbpo import MBPO
+from sb3_rpto.baselines.pdml import PDML
+from sb3_rpto.baselines.ptp import PTP
+from sb3_rpto.baselines.slbo import SLBO
 
 STAGE = {"iterations": 3, "model_steps": 2, "policy_updates": 1, "rollout_samples": 40, "rollout_length": 20}
 OWN = {
@@ -20,7 +20,7 @@ OWN = {
 
 @pytest.fixture(autouse=True)
 def _short_value_fit(monkeypatch):
-    monkeypatch.setattr("sb3_rpto.algorithms.distil.clone.__defaults__", (20,))
+    monkeypatch.setattr("sb3_rpto.baselines.policy_distillation.clone.__defaults__", (20,))
 
 
 def counted_fits(model, monkeypatch, interrupt):

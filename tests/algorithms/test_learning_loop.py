@@ -18,7 +18,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms import warm_start
 from sb3_rpto.buffers import chronological
 
 
@@ -475,7 +475,7 @@ def test_the_budget_of_source_steps_is_not_exceeded():
     ],
 )
 def test_every_target_step_is_matched_with_so_many_source_steps(sources, targets, train_freq, budgets, monkeypatch):
-    monkeypatch.setattr(warm, "FIRST_SOURCE_STEPS", 0)
+    monkeypatch.setattr(warm_start, "FIRST_SOURCE_STEPS", 0)
     env = make_vec_env(pendulum, n_envs=sources)
     target = make_vec_env(lambda: gym.make("Pendulum-v1", g=12.0, max_episode_steps=20), n_envs=targets)
     model = small(RPO, env, target, train_freq=train_freq, source_steps=4)

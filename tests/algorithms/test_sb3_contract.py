@@ -37,8 +37,8 @@ from stable_baselines3.sac.policies import SACPolicy
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms import warm
-from sb3_rpto.algorithms.source import EpisodeSource
+from sb3_rpto.algorithms import warm_start
+from sb3_rpto.algorithms.rollouts import EpisodeSource
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 
 EPISODE = 10
@@ -54,9 +54,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:EnsembleDynamics learns terminat
 
 @pytest.fixture(autouse=True)
 def _shortest_source_phase(_short_source_phase, monkeypatch):
-    monkeypatch.setattr(warm, "PHI_0_STEPS", 20)
-    monkeypatch.setattr(warm, "PHI_0_UPDATES", 3)
-    monkeypatch.setattr(warm, "FIRST_SOURCE_STEPS", 20)
+    monkeypatch.setattr(warm_start, "PHI_0_STEPS", 20)
+    monkeypatch.setattr(warm_start, "PHI_0_UPDATES", 3)
+    monkeypatch.setattr(warm_start, "FIRST_SOURCE_STEPS", 20)
 
 
 class Drift(gym.Env):

@@ -31,7 +31,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples, TrainFreq
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 from sb3_rpto import RPO, RPTO, DualReplayBuffer, DynamicsEnv
-from sb3_rpto.algorithms import warm
+from sb3_rpto.algorithms import warm_start
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 
 SAC_DEFAULTS = {
@@ -69,9 +69,9 @@ ours = pytest.mark.parametrize("cls", OURS)
 
 @pytest.fixture(autouse=True)
 def _shortest_source_phase(_short_source_phase, monkeypatch):
-    monkeypatch.setattr(warm, "PHI_0_STEPS", 20)
-    monkeypatch.setattr(warm, "PHI_0_UPDATES", 3)
-    monkeypatch.setattr(warm, "FIRST_SOURCE_STEPS", 20)
+    monkeypatch.setattr(warm_start, "PHI_0_STEPS", 20)
+    monkeypatch.setattr(warm_start, "PHI_0_UPDATES", 3)
+    monkeypatch.setattr(warm_start, "FIRST_SOURCE_STEPS", 20)
 
 
 def sac(env=None, **kwargs):

@@ -13,8 +13,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms.descent import Descent
-from sb3_rpto.algorithms.forward import sample_actions
+from sb3_rpto.algorithms.fast_forward import sample_actions
+from sb3_rpto.algorithms.fused_optimizer import Descent
 from sb3_rpto.algorithms.update import ALTERNATION, GATHERED
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.weights import rto_weights

@@ -16,15 +16,15 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPTO, cli
-from sb3_rpto.algorithms import closing
+from sb3_rpto.algorithms.closed_loop import controller
 from sb3_rpto.algorithms.normalisation import read_statistics
 from sb3_rpto.commands import enjoy
 from sb3_rpto.commands.progress import Progress
 from sb3_rpto.commands.recordings import digest
 from sb3_rpto.effects import LIBRARY
-from sb3_rpto.effects.carry import load_corrected
+from sb3_rpto.effects.corrected_model_io import load_corrected
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.tracing import Measurements
+from sb3_rpto.sysid import Measurements
 
 ENV = "InvertedPendulum-v5"
 FEW = ["--steps", "320", "--set", "source_steps=4", "--set", "gradient_steps=2", "--device", "cpu", "--quiet"]
@@ -149,7 +149,7 @@ def test_its_folder_is_enjoyed_in_the_corrected_simulator(given: Path, tmp_path:
 @pytest.mark.slow
 def test_a_simulated_log_is_traced_as_one_where_that_is_said(given: Path, tmp_path: Path, monkeypatch) -> None:
     found = []
-    monkeypatch.setattr(closing, "trace", lambda env, data, *args, **kwargs: found.append(data) or 1 / 0)
+    monkeypatch.setattr(controller, "trace", lambda env, data, *args, **kwargs: found.append(data) or 1 / 0)
     for options in ([], ["--simulated"]):
         with pytest.raises(ZeroDivisionError):
             adapt(given, tmp_path, *options)
@@ -187,7 +187,7 @@ def test_a_killed_run_goes_on_as_if_it_had_not_been(given: Path, tmp_path: Path,
         patch.setattr(Progress, "_add_row", interrupted)
         assert adapt(given, tmp_path / "killed") == 130
     assert (tmp_path / "killed" / "report.html").exists()
-    monkeypatch.setattr(closing, "trace", lambda *args, **kwargs: traces.append(1) or 1 / 0)
+    monkeypatch.setattr(controller, "trace", lambda *args, **kwargs: traces.append(1) or 1 / 0)
     assert adapt(given, tmp_path / "killed") == 0
     assert not traces
     one, other = (RPTO.load(tmp_path / name / "model.zip", device="cpu").policy for name in ("whole", "killed"))

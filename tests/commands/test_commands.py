@@ -24,14 +24,14 @@ from stable_baselines3.common.save_util import load_from_pkl
 
 from sb3_rpto import RPO, RPTO, cli
 from sb3_rpto.algorithms.normalisation import statistics_of
-from sb3_rpto.algorithms.slbo import SLBO
+from sb3_rpto.baselines.slbo import SLBO
 from sb3_rpto.commands import enjoy, options, video
 from sb3_rpto.commands.plot import draw, read_rows
 from sb3_rpto.commands.policies import load_policy
 from sb3_rpto.commands.runs import RunFolder, SavedCurve
-from sb3_rpto.effects.carry import load_corrected
-from sb3_rpto.experiments.curve import evaluate
-from sb3_rpto.experiments.report import summarise
+from sb3_rpto.effects.corrected_model_io import load_corrected
+from sb3_rpto.evaluation.learning_curve import evaluate
+from sb3_rpto.evaluation.statistics import summarise
 
 SOURCE, TARGET = "rpto/ContinuousCartPole-v0", "rpto/ContinuousCartPole-limb-x2-v0"
 SMALL_SAC = ["--set", "policy_kwargs={net_arch: [16]}", "--set", "learning_starts=20"]

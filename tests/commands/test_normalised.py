@@ -18,7 +18,7 @@ from test_commands import JUDGED, SETTINGS, SOURCE, TARGET, interrupt_at, rows
 from sb3_rpto import cli
 from sb3_rpto.algorithms.normalisation import read_statistics
 from sb3_rpto.commands.policies import NormalisedPolicy, load_policy
-from sb3_rpto.experiments.curve import evaluate
+from sb3_rpto.evaluation.learning_curve import evaluate
 
 EVERY = [
     pytest.param(m, marks=pytest.mark.slow if m in ("slbo", "trpo-warm", "sysid-retrain", "rto") else ())

@@ -20,7 +20,7 @@ from shifted import HOPPER, POLE, POLES, SHIFTS, collect, joined, noisy, observe
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPTO
-from sb3_rpto.algorithms.machine import doubt
+from sb3_rpto.algorithms.target_checks import doubt
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.env import DynamicsEnv
 from sb3_rpto.dynamics.physical import PhysicalDynamics

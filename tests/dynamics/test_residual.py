@@ -13,7 +13,7 @@ from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.effects import Effect, from_json
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.envs.rules import task_rules
+from sb3_rpto.envs.task_rules import task_rules
 
 TINY = {"n_members": 3, "n_elites": 3, "hidden": (64, 64), "max_steps": 800}
 MISSING = {

@@ -21,7 +21,7 @@ from sb3_rpto.effects import (
     register,
 )
 from sb3_rpto.effects.names import near
-from sb3_rpto.effects.trial import try_out
+from sb3_rpto.effects.validate_effect import try_out
 
 XML = """
 <mujoco>

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_rpto.effects import Declared, Scales, declare, parameter_names
-from sb3_rpto.effects.carry import correct
+from sb3_rpto.effects.corrected_model_io import correct
 from sb3_rpto.effects.library import candidates
 from sb3_rpto.effects.world import BatchWorld, LiveWorld, World
 

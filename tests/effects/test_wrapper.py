@@ -21,7 +21,7 @@ from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.wrapper import CorrectedEnv, beyond_model, corrections
-from sb3_rpto.envs.copies import copy_env
+from sb3_rpto.envs.env_copy import copy_env
 
 POLE = "InvertedDoublePendulum-v5"
 #: other test modules may register effects of their own while all are collected

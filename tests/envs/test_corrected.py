@@ -17,10 +17,10 @@ from sb3_rpto.effects import LIBRARY, Declared, Effect, Parameter, declare
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
 from sb3_rpto.effects.model import differing
 from sb3_rpto.effects.wrapper import CorrectedEnv
-from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.corrected import apply_effects, check_carries
+from sb3_rpto.envs.env_copy import copy_env
+from sb3_rpto.envs.env_snapshot import restore_state, save_state
 from sb3_rpto.envs.shifts import EnvShift
-from sb3_rpto.envs.state import restore_state, save_state
 
 POLE = "InvertedDoublePendulum-v5"
 

@@ -16,12 +16,12 @@ from sb3_rpto.effects import LIBRARY, Declared
 from sb3_rpto.effects.inertia import matrices, to_tensor
 from sb3_rpto.effects.model import numbers
 from sb3_rpto.effects.wrapper import CorrectedEnv, corrections
-from sb3_rpto.envs.copies import copy_env
 from sb3_rpto.envs.corrected import apply_effects
+from sb3_rpto.envs.env_copy import copy_env
 from sb3_rpto.envs.shifts import EnvShift, ShiftedCartPole, differs
 from sb3_rpto.envs.swimmer import swimmer_spec
 from sb3_rpto.envs.tasks import TARGETS, TASKS, env_id, make_shift, shift_names
-from sb3_rpto.tracing import Report
+from sb3_rpto.sysid import Report
 
 CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
 TURNING = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL)

@@ -16,13 +16,13 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_rpto.dynamics.simulator import physical_config
-from sb3_rpto.effects.carry import load_corrected, save_corrected
+from sb3_rpto.effects.corrected_model_io import load_corrected, save_corrected
 from sb3_rpto.effects.model import load_model, numbers
 from sb3_rpto.envs import tasks
+from sb3_rpto.envs.env_snapshot import restore_state, save_state
 from sb3_rpto.envs.observations import state_map
-from sb3_rpto.envs.rules import task_rules
 from sb3_rpto.envs.shifts import EnvShift
-from sb3_rpto.envs.state import restore_state, save_state
+from sb3_rpto.envs.task_rules import task_rules
 from sb3_rpto.envs.tasks import TARGETS, TASKS, env_id, make_shift, shift_names
 
 WALKERS = ["Ant", "HalfCheetah", "Hopper", "Walker2d"]

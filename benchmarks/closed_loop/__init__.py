@@ -1,0 +1,1 @@
+"""What closing the loop is worth: ``python -m benchmarks closed_loop``."""

@@ -1,0 +1,1 @@
+"""Three real machines, measured by others: ``python -m benchmarks machines``."""

@@ -1,0 +1,1 @@
+"""The closed loop inside ``learn()``: identify, accept, retrain, select."""

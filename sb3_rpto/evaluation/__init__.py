@@ -1,0 +1,1 @@
+"""Learning curves, interquartile means with intervals, and the relativity gap."""

@@ -1,1 +1,0 @@
-"""Experiments: one run, many runs, and what they say together."""

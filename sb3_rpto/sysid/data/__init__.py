@@ -1,0 +1,1 @@
+"""Measurements: read from files, checked, repaired."""

@@ -1,0 +1,1 @@
+"""Other ways to read recordings that a search does not explain."""

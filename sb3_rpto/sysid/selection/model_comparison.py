@@ -1,0 +1,125 @@
+"""Is one model better than another on windows that neither was fitted to? Evidence from independent blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from sb3_rpto.sysid.shooting.windows import Windows
+
+#: Effects must lower the typical window error by this share to stay.
+GAIN = 0.03
+#: Errors below this many units of noise are none: exact data are met to rounding, where any ratio may be large.
+NOTHING = 0.5
+#: The t of fewer blocks counts as what is as unlikely among so many: two or three may agree by chance.
+BLOCKS = 6
+#: Most folds of a cross-validation.
+FOLDS = 6
+#: Windows whose error is above so many units of the noise are missed; noise alone does not come near that.
+MISSED = 2.0
+#: What acts in few windows must save this share of the error of those that are missed without it, in so many blocks.
+RARE, SEVERAL = 0.5, 3
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a model gains over another on the select windows.
+
+    :param gain: share of the typical window error saved, 1 - exp(-mean log ratio)
+    :param t: mean log error ratio of the blocks over its standard error, see :func:`significance`; of the
+        missed windows alone where that is larger and they are few
+    :param blocks: the log ratio of each block, (b,)
+    :param missed: that of its windows which the other model misses, NaN where it misses none, (b,)
+    """
+
+    gain: float
+    t: float
+    blocks: np.ndarray
+    missed: np.ndarray
+
+    def clear(self, threshold: float, gain: float = GAIN) -> bool:
+        """Whether the gain is more than chance and more than a trifle."""
+        return self.t > threshold and self.gain > gain
+
+    def frequency(self, limit: tuple[float, float], rng: np.random.Generator, resamples: int = 200) -> float:
+        """Share of resampled sets of blocks in which the gain is clear by a limit of t and gain."""
+        draws = [rng.integers(len(self.blocks), size=len(self.blocks)) for _ in range(resamples)]
+        return float(np.mean([evidence_of(self.blocks[rows], self.missed[rows]).clear(*limit) for rows in draws]))
+
+
+def compare(without: np.ndarray, with_: np.ndarray, blocks: np.ndarray, rare: bool = False) -> Evidence:
+    """Evidence for the model with an effect against the one without.
+
+    :param without: errors of the windows, (W,)
+    :param with_: errors of the same windows, (W,)
+    :param blocks: number of the block of each window, (W,)
+    :param rare: whether it may come from few windows, where the typical one is met without the effect
+    """
+    ratio = np.log(np.maximum(without, NOTHING)) - np.log(np.maximum(with_, NOTHING))
+    missed = without > MISSED if rare and np.median(without) <= MISSED else np.zeros(len(without), dtype=bool)
+
+    def mean(rows: np.ndarray) -> float:
+        return float(ratio[rows].mean()) if rows.any() else np.nan
+
+    members = [blocks == b for b in np.unique(blocks)]
+    return evidence_of(np.array([mean(m) for m in members]), np.array([mean(m & missed) for m in members]))
+
+
+def evidence_of(blocks: np.ndarray, missed: np.ndarray) -> Evidence:
+    """Evidence from log ratios, as :class:`Evidence` has them.
+
+    An effect that acts in a share p of n blocks never has a t above sqrt(n p / (1 - p)), however much it saves there:
+    where the others go without it, those few are what speaks for it.
+    """
+    t, few = significance(blocks), missed[~np.isnan(missed)]
+    if len(few) >= SEVERAL and _gain(few) > RARE:
+        t = max(t, significance(few))
+    return Evidence(_gain(blocks), t, blocks, missed)
+
+
+def several_missed(errors: np.ndarray, blocks: np.ndarray) -> bool:
+    """Whether windows of several blocks are missed: fewer could not speak for an effect."""
+    return len(np.unique(blocks[errors > MISSED])) >= SEVERAL
+
+
+def significance(blocks: np.ndarray) -> float:
+    """Mean over standard error; among less than :data:`BLOCKS` that which is as unlikely by chance among so many."""
+    if len(blocks) < 2:
+        return 0.0
+    # Few blocks may agree by chance: their spread counts as at least a percent.
+    error = max(float(blocks.std(ddof=1)), 0.01) / np.sqrt(len(blocks))
+    return _among_many(float(blocks.mean()) / error, len(blocks))
+
+
+def _gain(blocks: np.ndarray) -> float:
+    return 1 - float(np.exp(-blocks.mean()))
+
+
+def _among_many(t: float, count: int) -> float:
+    """The t that is as unlikely by chance among :data:`BLOCKS` blocks as this is among fewer."""
+    if count >= BLOCKS:
+        return t
+    # By the upper tail, which keeps its digits where 1 - p has none left.
+    return float(np.copysign(student.isf(student.sf(abs(t), count - 1), BLOCKS - 1), t))
+
+
+def folds(windows: Windows, horizon: float, count: int = FOLDS) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Part windows into folds by whole blocks: indices to fit and to judge on, with a window's gap between them.
+
+    :param windows: which may overlap
+    :param horizon: length of a window in s
+    :param count: most folds
+    """
+    names = np.unique(windows.block)
+    turn = np.searchsorted(names, windows.block) % min(count, len(names))
+    same = windows.episode[:, None] == windows.episode
+    beside = same & (np.abs(windows.time[:, None] - windows.time) < 2 * horizon - 1e-6)
+    parts = []
+    for k in range(turn.max() + 1):
+        chosen = turn == k
+        others = ~chosen & ~beside[:, chosen].any(axis=1)
+        # Where the gap leaves nothing, the data are too short for one.
+        parts.append((np.flatnonzero(others if others.any() else ~chosen), np.flatnonzero(chosen)))
+    return parts

@@ -1,0 +1,1 @@
+"""Multiple shooting: windows of recordings, their initial states, and fits to them."""

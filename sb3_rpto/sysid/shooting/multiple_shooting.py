@@ -1,0 +1,467 @@
+"""Fitting the parameters of a simulation to windows of recordings (multiple shooting)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sb3_rpto.dynamics.box import bounded_step, stepped
+from sb3_rpto.effects import Declared, Scales, Simulation
+from sb3_rpto.fitting.loss import Loss
+from sb3_rpto.sysid.shooting.initial_states import moved, straight
+from sb3_rpto.sysid.shooting.interpolation import between, interpolate
+from sb3_rpto.sysid.shooting.windows import Windows
+
+#: Where a simulation became unstable, its residual in units of the noise.
+UNSTABLE = 1e4
+#: Weak pull of an effect's parameters towards their null values, in plausible sizes.
+RIDGE = 30.0
+#: Finite differences, in plausible sizes: at a null value they are as wide as the effect must be to show.
+WIDE, NARROW = 1.0, 0.01
+#: Shares of a start's step that are tried.
+SHARES = (1.0, 0.2)
+#: Changes of the damping that are tried, in their turn: the first alone where its step does as promised.
+LADDER = ((0.1,), (1.0, 10.0, 100.0), (1e4, 1e6))
+#: Share of the promised fall of the cost that is enough to take a step without looking further.
+KEPT = 0.5
+#: Fits to measured data far from the noise end when the cost falls by less than this share: what is missing makes it.
+CRUDE = 0.01
+#: All windows' errors below so many units of the noise, for exact data 1e-7 of what a position varies by, are met.
+MET = 1e-3
+#: Steps of the starts by themselves after which a verdict may rest on them; none where all fall by less than a share.
+START_STEPS, STILL = 10, 1e-3
+#: Most simulations in one batch.
+CHUNK = 6000
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters fitted to windows.
+
+    :param values: all parameters of the simulation, (p,)
+    :param starts: corrections of the windows' starts, in units of their spread, (W, 2 nv)
+    :param errors: root mean squared residual of each window in units of the noise, (W,)
+    :param cost: robust cost, comparable between fits of like size only
+    :param linear: the cost around it, where it is known
+    """
+
+    values: np.ndarray
+    starts: np.ndarray
+    errors: np.ndarray
+    cost: float
+    linear: Linear | None = None
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The cost around a fit, each window's start eliminated, in coordinates of plausible sizes.
+
+    :param normal: (W, f, f) Gauss-Newton matrices of the free parameters
+    :param gradient: (W, f)
+    :param free: indices of the free parameters, (f,)
+    """
+
+    normal: np.ndarray
+    gradient: np.ndarray
+    free: np.ndarray
+
+    def fall(self, rows: np.ndarray) -> float:
+        """How far the cost would fall by some of the free parameters if it were quadratic."""
+        normal, gradient = self.normal.sum(0)[np.ix_(rows, rows)], self.gradient.sum(0)[rows]
+        ridge = 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(rows))
+        return float(gradient @ np.linalg.solve(normal + ridge, gradient))
+
+
+class Problem:
+    """Windows, and the simulation that is to predict them.
+
+    Unknown are the simulation's parameters, common to all windows, and each window's start, near its smoothed state.
+    The residual is (predicted - measured) / noise, and the corrections of the start in units of their trusted spread.
+
+    :param simulation: with all effects that may be free
+    :param windows: recordings
+    :param scales: what is large at each effect's place, in the order of the effects
+    """
+
+    def __init__(self, simulation: Simulation, windows: Windows, scales: Sequence[Scales]) -> None:
+        self.simulation, self.windows, self.scales = simulation, windows, scales
+        parameters = [(p, s) for e, s in zip(simulation.effects, scales) for p in e.parameters]
+        self.size = np.array([p.size_for(s) for p, s in parameters])
+        self.lower = simulation.lower
+        self.upper = np.array(
+            [
+                e.ceiling(s) if isinstance(e, Declared) else p.upper
+                for e, s in zip(simulation.effects, scales)
+                for p in e.parameters
+            ]
+        )
+        self.null = simulation.null
+        self.known = np.array([e.known for e in simulation.effects for _ in e.parameters], dtype=bool)
+        self.moving = np.flatnonzero((windows.spread > 0).any(axis=0))  # coordinates of the start that are free
+        self.exact, self.touching = windows.exact, windows.touching
+
+    def on(self, index: np.ndarray) -> Problem:
+        """The same problem on the windows at ``index``."""
+        return Problem(self.simulation, self.windows.take(index), self.scales)
+
+    def first(self, samples: int) -> Problem:
+        """The same problem on the first samples of the windows."""
+        return Problem(self.simulation, self.windows.first(samples), self.scales)
+
+    # --- prediction ---------------------------------------------------------------------------------------------
+
+    def predict(self, values: np.ndarray, starts: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """What the sensors should have shown.
+
+        :param values: (n, p)
+        :param starts: corrections of the start, (n, 2 nv)
+        :param index: window of each of the n simulations, (n,)
+        :return: (n, S, m), NaN where unstable
+        """
+        parts = np.array_split(np.arange(len(index)), -(-len(index) // CHUNK))
+        return np.concatenate([self._predict(values[i], starts[i], index[i]) for i in parts])
+
+    def _predict(self, values: np.ndarray, starts: np.ndarray, index: np.ndarray) -> np.ndarray:
+        w, model = self.windows, self.simulation.model
+        shift = starts * w.spread[index] * w.trust
+        qpos, qvel = moved(model, w.qpos[index], shift[:, : model.nv]), w.qvel[index] + shift[:, model.nv :]
+        self.simulation.undo_sensors(values, qpos, qvel, w.qacc[index])
+        q, v = self.simulation.rollout(values, qpos, qvel, w.drive.take(index))
+        dt, dofs, at = float(model.opt.timestep), self._dofs(), dict.fromkeys(range(len(w.columns)), w.at[index])
+        out = interpolate(q, v, w.at[index], dt, w.columns, dofs)
+        sensing = self.simulation.sensing(values)
+        for effect, x in sensing:
+            age = effect.late(x)
+            for column in np.flatnonzero(w.columns == effect.adr) if age.any() else ():
+                at[column] = w.at[index] - age[:, None] / dt
+                out[:, :, [column]] = interpolate(q, v, at[column], dt, w.columns[[column]], dofs[[column]])
+        for effect, x in sensing:
+            for column in np.flatnonzero(w.columns == effect.adr):
+                speed = between(v[:, :, effect.dof], at[column])
+                out[:, :, column] = effect.observe(out[:, :, column], speed, x[:, None])[0]
+        return out
+
+    def _dofs(self) -> np.ndarray:
+        """Address in qvel of each observed column, -1 for a coordinate without a velocity of its own."""
+        dof_of = straight(self.simulation.model)
+        return np.array([dof_of.get(int(c), -1) for c in self.windows.columns])
+
+    def residuals(self, values: np.ndarray, starts: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Residuals in units of the noise, (n, S m); zero for samples that do not count."""
+        w = self.windows
+        r = (self.predict(values, starts, index) - w.measured[index]) / w.sigma
+        r = np.clip(np.nan_to_num(r, nan=UNSTABLE), -UNSTABLE, UNSTABLE)
+        return (r * w.usable[index][:, :, None]).reshape(len(index), -1)
+
+    def errors(self, residuals: np.ndarray) -> np.ndarray:
+        """Root mean squared residual of each window, (W,), from (W, S m)."""
+        counts = self.windows.usable.sum(axis=1) * self.windows.measured.shape[2]
+        return np.sqrt((residuals**2).sum(axis=1) / counts)
+
+    def unstable(self, values: np.ndarray) -> int:
+        """Number of windows whose simulation blows up, from the smoothed starts."""
+        count = len(self.windows)
+        starts = np.zeros((count, 2 * self.simulation.model.nv))
+        predicted = self.predict(np.tile(values, (count, 1)), starts, np.arange(count))
+        return int((~np.isfinite(predicted)).any(axis=(1, 2)).sum())
+
+    # --- derivatives --------------------------------------------------------------------------------------------
+
+    def steps(self, values: np.ndarray) -> np.ndarray:
+        """Finite-difference steps of all parameters in their units, (p,), pointing inside the bounds."""
+        at_null = np.isclose(values, self.null, rtol=0, atol=1e-9 * self.size) & ~self.known
+        step = np.where(at_null, WIDE, NARROW) * self.size
+        return np.where(values + step > self.upper, -step, step)
+
+    def linearise(
+        self,
+        values: np.ndarray,
+        starts: np.ndarray,
+        free: np.ndarray,
+        base: np.ndarray | None = None,
+        down: bool = False,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals and their derivatives by the free parameters (in plausible sizes) and by the start.
+
+        :param values: (p,), or (W, p) for parameters of its own in each window (then none may be free)
+        :param starts: (W, 2 nv)
+        :param free: (f,) indices
+        :param base: the residuals, (W, R), where they are known from before
+        :param down: the parameters' differences are taken on the other side
+        :return: (W, R), (W, R, f), (W, R, x)
+        """
+        count, f, x = len(self.windows), len(free), len(self.moving)
+        if self.simulation.model.na:
+            base = None  # how long filters are led depends on what is simulated beside
+        columns, p = f + x + (base is None), values.shape[-1]
+        all_values = np.tile(np.broadcast_to(values, (count, p)), (columns, 1, 1))
+        all_starts = np.tile(starts, (columns, 1, 1))
+        step = self.steps(values)[free] * (-1 if down else 1) if f else np.empty(0)
+        for i, parameter in enumerate(free):
+            all_values[i, :, parameter] += step[i]
+        for i, coordinate in enumerate(self.moving):
+            all_starts[f + i, :, coordinate] += 0.3
+        index = np.tile(np.arange(count), columns)
+        r = self.residuals(all_values.reshape(columns * count, p), all_starts.reshape(columns * count, -1), index)
+        r = r.reshape(columns, count, -1)
+        base = r[-1] if base is None else base
+        by_values = (r[:f] - base) * (self.size[free] / step)[:, None, None]
+        by_start = (r[f : f + x] - base) / 0.3
+        # A difference across a simulation that blew up says nothing.
+        by_values, by_start = (np.where(np.abs(d) < 0.5 * UNSTABLE, d, 0.0) for d in (by_values, by_start))
+        return base, by_values.transpose(1, 2, 0), by_start.transpose(1, 2, 0)
+
+    # --- fits ---------------------------------------------------------------------------------------------------
+
+    def reduce(self, r: np.ndarray, jt: np.ndarray, jx: np.ndarray, starts: np.ndarray, loss: Loss) -> _Reduced:
+        """Weighted normal equations of each window with its start eliminated (Schur complement)."""
+        weight = 1 / np.sqrt(1 + (r / loss.clip) ** 2)
+        wt = jt * weight[:, :, None]
+        normal, gradient = np.einsum("wrf,wrg->wfg", wt, jt), np.einsum("wrf,wr->wf", wt, r)
+        gain, move = np.zeros((len(r), jx.shape[2], jt.shape[2])), np.zeros((len(r), jx.shape[2]))
+        fall = np.zeros(len(r))
+        if jx.shape[2]:
+            wx = jx * weight[:, :, None]
+            hxx = np.einsum("wrx,wry->wxy", wx, jx) + loss.hold * np.eye(jx.shape[2])
+            hxt = np.einsum("wrx,wrf->wxf", wx, jt)
+            gx = np.einsum("wrx,wr->wx", wx, r) + loss.hold * starts[:, self.moving]
+            gain, move = np.linalg.solve(hxx, hxt), np.linalg.solve(hxx, gx[:, :, None])[:, :, 0]
+            normal = normal - np.einsum("wxf,wxg->wfg", hxt, gain)
+            gradient = gradient - np.einsum("wxf,wx->wf", hxt, move)
+            fall = (gx * move).sum(-1)
+        return _Reduced(normal, gradient, gain, move, fall)
+
+    def cost(self, r: np.ndarray, starts: np.ndarray, values: np.ndarray, loss: Loss) -> np.ndarray:
+        """Robust cost of one or more candidates: r (..., W, R), starts (..., W, 2 nv), values (..., p)."""
+        pull = np.where(self.known, 0.0, (values - self.null) / self.size / RIDGE) ** 2
+        return loss.energy(r, starts).sum(-1) + pull.sum(-1)
+
+    def fit(
+        self,
+        values: np.ndarray,
+        free: np.ndarray,
+        starts: np.ndarray | None = None,
+        iterations: int = 12,
+        tolerance: float = 1e-3,
+        crude: float = CRUDE,
+    ) -> Fit:
+        """Levenberg-Marquardt on the free parameters and all starts, within the bounds.
+
+        :param values: where it begins, (p,); the others stay
+        :param free: indices, (f,)
+        :param starts: as in :class:`Fit`; default: the smoothed states
+        :param iterations: most steps
+        :param tolerance: stop when the cost falls by less than this share
+        :param crude: the same of measured data far from the noise, where the typical window's falls no more either
+        :return: never worse than where it began, if that is within the bounds
+        """
+        values, damping, linear = values.copy(), 1e-3, None
+        r: np.ndarray | None = None
+        values[free] = np.clip(values[free], self.lower[free], self.upper[free])
+        starts = np.zeros((len(self.windows), 2 * self.simulation.model.nv)) if starts is None else starts.copy()
+        for _ in range(iterations):
+            r, jt, jx = self.linearise(values, starts, free, r)
+            loss = Loss.of(r)
+            now = float(self.cost(r, starts, values, loss))
+            reduced = self.reduce(r, jt, jx, starts, loss)
+            promised = self._promise(values, free, reduced, LADDER[0][0] * damping)
+            if promised < tolerance * now or self.errors(r).max() < MET:
+                linear = Linear(reduced.normal, reduced.gradient, free)
+                break
+            step = self._descend(values, starts, free, reduced, damping, loss, now, promised)
+            slow = loss.far and self._slow(loss, (r, starts), step, now, crude)
+            if step.cost < now:
+                values, starts, r = step.values, step.starts, step.residuals
+                damping = float(np.clip(step.damping, 1e-6, 1e6))
+            if slow or now - step.cost < tolerance * now:
+                break
+        assert r is not None  # there is an iteration
+        return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, Loss.of(r))), linear)
+
+    def _slow(self, loss: Loss, before: tuple[np.ndarray, np.ndarray], step: _Step, now: float, share: float) -> bool:
+        """Whether measured data are met better by less than a share after a step, as a whole and typically.
+
+        In kinks, which contacts make and exact data show, fits creep before they get on.
+        """
+        if self.exact or self.touching or now - step.cost > share * now:
+            return False
+        ratio = loss.energy(step.residuals, step.starts) / np.maximum(loss.energy(*before), 1e-300)
+        return bool(np.median(ratio) > 1 - share)
+
+    def _promise(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced, damping: float) -> float:
+        """How far the cost would fall with a step if it were quadratic."""
+        z = self._step(values, free, reduced, damping)[free] / self.size[free]
+        normal, gradient = self._normal(values, free, reduced)
+        return float(reduced.fall.sum() - 2 * gradient @ z - z @ normal @ z)
+
+    def _descend(
+        self,
+        values: np.ndarray,
+        starts: np.ndarray,
+        free: np.ndarray,
+        reduced: _Reduced,
+        damping: float,
+        loss: Loss,
+        now: float,
+        promised: float,
+    ) -> _Step:
+        """The best step of the first rung of dampings that lowers the cost; of the lowest rung, by what it promised."""
+        best, enough = None, now - KEPT * promised
+        for factors in LADDER if len(free) else LADDER[:1]:
+            step = self._try(values, starts, free, reduced, damping * np.array(factors), loss)
+            if best is None or step.cost < best.cost:
+                best = step
+            if best.cost < enough:
+                break
+            enough = now
+        assert best is not None  # the ladder has rungs
+        return best
+
+    def _try(
+        self,
+        values: np.ndarray,
+        starts: np.ndarray,
+        free: np.ndarray,
+        reduced: _Reduced,
+        dampings: np.ndarray,
+        loss: Loss,
+    ) -> _Step:
+        """Simulate the steps of several dampings side by side, and take the best.
+
+        Each window takes what suits it of its start's own step: near an unstable pose a whole step may lead astray.
+        """
+        count, tries = len(self.windows), len(dampings)
+        steps = np.stack([self._step(values, free, reduced, d) for d in dampings])
+        follow = np.einsum("wxf,tf->twx", reduced.gain, steps[:, free] / self.size[free])
+        moves = np.stack([share * (reduced.move + follow) for share in SHARES])
+        trial_starts = np.tile(starts, (len(SHARES), tries, 1, 1))
+        trial_starts[..., self.moving] -= moves
+        trial_values = stepped(values, steps, self.lower, self.upper)
+        r = self.residuals(
+            np.tile(np.repeat(trial_values, count, 0), (len(SHARES), 1)),
+            trial_starts.reshape(len(SHARES) * tries * count, -1),
+            np.tile(np.arange(count), len(SHARES) * tries),
+        ).reshape(len(SHARES), tries, count, -1)
+        share = np.argmin(loss.energy(r, trial_starts), axis=0), np.arange(tries)[:, None], np.arange(count)
+        costs = self.cost(r[share], trial_starts[share], trial_values, loss)
+        best = int(np.argmin(costs))
+        return _Step(
+            trial_values[best], trial_starts[share][best], r[share][best], float(costs[best]), float(dampings[best])
+        )
+
+    def _step(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced, damping: float) -> np.ndarray:
+        """A damped Gauss-Newton step within the bounds, (p,); what would leave them is held there."""
+        step = np.zeros(len(values))
+        if not len(free):
+            return step
+        normal, gradient = self._normal(values, free, reduced)
+        normal = normal + damping * np.diag(np.diag(normal) + 1e-3 * np.diag(normal).max() + 1e-12)
+        low, high = ((b[free] - values[free]) / self.size[free] for b in (self.lower, self.upper))
+        step[free] = bounded_step(normal, gradient, low, high) * self.size[free]
+        return np.clip(values + step, self.lower, self.upper) - values
+
+    def _normal(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced) -> tuple[np.ndarray, np.ndarray]:
+        """The normal equations of all windows with the pull towards the null values, (f, f) and (f,)."""
+        pull = np.where(self.known[free], 0.0, 1 / RIDGE**2)
+        z = (values[free] - self.null[free]) / self.size[free]
+        return reduced.normal.sum(0) + np.diag(pull), reduced.gradient.sum(0) + pull * z
+
+    def bounded_fall(self, linear: Linear, values: np.ndarray) -> float:
+        """How far the cost would fall within the bounds of the free parameters if it were quadratic.
+
+        :param linear: the cost around ``values``, (p,)
+        """
+        free, normal, gradient = linear.free, linear.normal.sum(0), linear.gradient.sum(0)
+        if not len(free):
+            return 0.0
+        damped = normal + 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(free))
+        low, high = ((b[free] - values[free]) / self.size[free] for b in (self.lower, self.upper))
+        z = bounded_step(damped, gradient, np.minimum(low, 0.0), np.maximum(high, 0.0))
+        return float(-2 * gradient @ z - z @ normal @ z)
+
+    def linear(self, fit: Fit, free: np.ndarray) -> Linear:
+        """The reduced normal equations at a fit, for screening, elimination and intervals."""
+        if fit.linear is not None and np.array_equal(fit.linear.free, free):
+            return fit.linear
+        r, jt, jx = self.linearise(fit.values, fit.starts, free)
+        reduced = self.reduce(r, jt, jx, fit.starts, Loss.of(r))
+        return Linear(reduced.normal, reduced.gradient, free)
+
+    def score(self, values: np.ndarray, starts: np.ndarray | None = None, iterations: int = 2) -> Fit:
+        """Errors of the windows with the parameters given and their starts fitted.
+
+        :param values: (p,), or (W, p) for parameters of its own in each window
+        :param starts: where to begin, as in :class:`Fit`; default: the smoothed states
+        :param iterations: Gauss-Newton steps of the starts
+        """
+        count, none = len(self.windows), np.empty(0, dtype=int)
+        starts = np.zeros((count, 2 * self.simulation.model.nv)) if starts is None else starts.copy()
+        rows = np.broadcast_to(values, (count, values.shape[-1]))
+        best = None
+        for _ in range(iterations if len(self.moving) else 0):
+            r, jt, jx = self.linearise(values, starts, none, best)
+            loss = Loss.of(r)
+            trial = starts.copy()
+            trial[:, self.moving] -= self.reduce(r, jt, jx, starts, loss).move
+            now = self.residuals(rows, trial, np.arange(count))
+            before, after = loss.energy(r, starts), loss.energy(now, trial)
+            better = after < before
+            starts = np.where(better[:, None], trial, starts)
+            best = np.where(better[:, None], now, r)
+            if np.minimum(before, after).sum() > (1 - STILL) * before.sum():
+                break
+        best = self.residuals(rows, starts, np.arange(count)) if best is None else best
+        return Fit(values, starts, self.errors(best), float(Loss.of(best).energy(best, starts).sum()))
+
+    def redrawn(self, fit: Fit, rng: np.random.Generator) -> Problem:
+        """The same windows as the model itself would have been measured; starts that are samples get noise, too."""
+        w, every, nv = self.windows, np.arange(len(self.windows)), self.simulation.model.nv
+        true = self.predict(np.tile(fit.values, (len(w), 1)), fit.starts, every)
+        measured = np.where(np.isfinite(true), true, w.measured) + rng.standard_normal(true.shape) * w.sigma
+        if w.noisy_starts:
+            off = (fit.starts + rng.standard_normal(fit.starts.shape)) * w.spread * w.trust
+            w = replace(w, qpos=moved(self.simulation.model, w.qpos, off[:, :nv]), qvel=w.qvel + off[:, nv:])
+        return Problem(self.simulation, replace(w, measured=measured), self.scales)
+
+    def noise_errors(self, fit: Fit, seed: int, draws: int = 8) -> np.ndarray:
+        """Errors that a true model would have: white noise, less what the fitted starts take of it, (draws, W).
+
+        Noisy starts may lie across a contact: their draws are simulated, where smoothed ones leave a slope to go by.
+        """
+        if self.windows.noisy_starts:
+            generators = np.random.default_rng(seed).spawn(draws)
+            drawn = (self.redrawn(fit, rng).score(fit.values, iterations=START_STEPS) for rng in generators)
+            return np.array([each.errors for each in drawn])
+        _, _, jx = self.linearise(fit.values, fit.starts, np.empty(0, dtype=int))
+        w = self.windows
+        rng = np.random.default_rng(seed)
+        mask = np.repeat(w.usable, w.measured.shape[2], axis=1)
+        out = []
+        for _ in range(draws):
+            r = rng.standard_normal(mask.shape) * mask
+            if jx.shape[2]:
+                hxx = np.einsum("wrx,wry->wxy", jx, jx) + np.eye(jx.shape[2])
+                move = np.linalg.solve(hxx, np.einsum("wrx,wr->wx", jx, r)[:, :, None])[:, :, 0]
+                r = r - np.einsum("wrx,wx->wr", jx, move)
+            out.append(self.errors(r))
+        return np.array(out)
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    normal: np.ndarray  # (W, f, f)
+    gradient: np.ndarray  # (W, f)
+    gain: np.ndarray  # (W, x, f), how the starts follow the parameters
+    move: np.ndarray  # (W, x), how the starts move by themselves
+    fall: np.ndarray  # (W,), of the energy by that
+
+
+@dataclass(frozen=True)
+class _Step:
+    values: np.ndarray  # (p,)
+    starts: np.ndarray  # (W, 2 nv)
+    residuals: np.ndarray  # (W, R)
+    cost: float
+    damping: float

@@ -1,9 +1,0 @@
-"""Closing the loop with measured data: recorded runs of a machine, what its model lacks to explain them, the report."""
-
-from sb3_rpto.tracing.checks import Finding
-from sb3_rpto.tracing.episodes import Episode
-from sb3_rpto.tracing.measurements import Measurements
-from sb3_rpto.tracing.report import Report
-from sb3_rpto.tracing.trace import trace  # after its module of the same name, which it stands for from here on
-
-__all__ = ["Episode", "Finding", "Measurements", "Report", "trace"]

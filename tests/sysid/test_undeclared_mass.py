@@ -1,0 +1,68 @@
+"""What speaks for a number that nobody declared, where recordings are not explained."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import pytest
+from simulated import PENDULUM, recorded
+
+from benchmarks.tracing.planting import generate
+from sb3_rpto.sysid import trace
+from sb3_rpto.sysid.hypotheses.undeclared_mass import undeclared_mass
+from sb3_rpto.sysid.problem.prepare import prepare
+from sb3_rpto.sysid.report.descriptions import VERDICTS, verdict
+from sb3_rpto.sysid.selection.pipeline import Found, Selection
+
+
+@pytest.mark.parametrize(
+    ("damping", "mass", "bodies"),
+    [
+        pytest.param(0.5, 0.5, [], marks=pytest.mark.slow, id="fitted anew"),
+        pytest.param(0.05, 0.4, ["pole"], id="another mass"),
+    ],
+)
+def test_a_mass_is_not_named_for_what_fitting_the_declared_numbers_does(
+    damping: float, mass: float, bodies: list[str]
+) -> None:
+    xml = PENDULUM.replace('mass="0.5"', f'mass="{mass}"').replace('damping="0.05"', f'damping="{damping}"')
+    set_up = prepare(xml, recorded(), ["hinge.damping"], 0, [], 0.35, 1)
+    on = set_up.selectors(0.35, lambda share, what: None)
+    fit = on.fine.train.fit(on.fine.simulation.null, on.fine.free(()), iterations=1)
+    base = on.fine.model((), fit)
+    base = replace(base, fit=replace(base.fit, values=on.fine.simulation.null))  # not fitted as well as it may be
+    hints = undeclared_mass(Found(on, base, None, None, Selection(base), None), set_up)  # type: ignore[arg-type]
+    assert [hint.where for hint in hints] == bodies
+    for hint in hints:
+        assert float(hint.message.split()[1]) == pytest.approx(0.5 / mass, rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_mass_that_was_not_declared_is_named_with_its_size() -> None:
+    planted = generate("cartpole", None, seed=3, episodes=6, duration=3.0)
+    light, times = 0.225, planted.truth.declared["pole.mass"] / 0.225
+    xml, found = re.subn(
+        r'mass="0.3" diaginertia="[^"]*"', f'mass="{light}" diaginertia="0.00675 0.00675 4.5e-05"', planted.xml
+    )
+    assert found == 1
+    others = [name for name in planted.declared if name != "pole.mass"]
+    report = trace(xml, planted.measurements, others, candidates=["coulomb_friction", "payload"])
+    assert report.verdict == "unexplained"
+    (hint,) = [finding for finding in report.findings if finding.kind == "undeclared mass"]
+    assert hint.where == "pole"
+    assert float(hint.message.split()[1]) == pytest.approx(times, rel=0.02)
+    assert "declare pole.mass" in hint.message
+    assert trace(xml, planted.measurements, planted.declared, candidates=["coulomb_friction"]).verdict == "complete"
+
+
+def test_candidates_that_the_model_has_no_place_for_are_named() -> None:
+    set_up = prepare(PENDULUM, recorded(), ["hinge.damping"], 0, ["wind", "spring", "wind"], 0.35, 1)
+    assert [finding.where for finding in set_up.findings if finding.kind == "no place"] == ["wind"]
+    assert [effect.kind for effect in set_up.fine.effects] == ["declared", "spring"]
+
+
+def test_where_nothing_was_looked_for_the_verdict_does_not_say_it_was() -> None:
+    assert "no effects were looked for" in verdict("unexplained", searched=False)[0]
+    assert verdict("unexplained", searched=True) == VERDICTS["unexplained"]
+    assert verdict("complete", searched=False) == VERDICTS["complete"]
