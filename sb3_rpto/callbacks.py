@@ -49,7 +49,8 @@ class RelativityGapCallback(TransferCallback):
     came from the source (``snapshots["source"]``) and its critic, estimated by
     :func:`~sb3_rpto.evaluation.relativity_gap.policy_gap_estimate` on the newest whole episodes in D_source.
     One-step branches are no episodes: there it is the mean advantage over the newest branches' states, divided by
-    1 - gamma, which takes these states for the discounted occupancy of pi. ``gap/dynamics_se`` and ``gap/policy_se`` are the standard errors.
+    1 - gamma, which takes these states for the discounted occupancy of pi. ``gap/dynamics_se`` and ``gap/policy_se``
+    are the standard errors.
 
     All are gaps of soft returns (entropy bonus included; that of the policy gap at the temperature of pi') on the
     critic's reward scale, which VecNormalize may have changed. They are as good as the critics, and the episodes are

@@ -56,13 +56,13 @@ def run(job: tuple[bool, int]) -> list[dict[str, Any]]:
             if steps:
                 model.learn(EVERY, reset_num_timesteps=False)
             target.seed(EVALUATION_SEED)
-            returns, lengths = evaluate_policy(  # type: ignore[misc]
+            returns, lengths = evaluate_policy(
                 model, target, n_eval_episodes=EPISODES, deterministic=True, return_episode_rewards=True, warn=False
             )
             rows.append(
                 {
                     **{"rehearsals": rehearsed, "seed": seed, "steps": steps, "return": np.mean(returns)},
-                    **{"falls": sum(length < WHOLE for length in lengths), "episodes": EPISODES},
+                    **{"falls": int(np.sum(np.less(lengths, WHOLE))), "episodes": EPISODES},
                     **{"updates": model._n_updates, "source_steps": model.source_timesteps},
                 }
             )

@@ -168,8 +168,8 @@ def undetermined(problem: Problem, values: np.ndarray, intervals: np.ndarray) ->
             is_number = isinstance(effect, Declared)
             where = f"declared {effect.label}" if is_number else f"known {effect.label}, {parameter.name}"
             message = (
-                f"{value:.4g} {descriptions.interval(low, high)}: these data do not tell it; move so that it matters, do "
-                f"not {'declare it, or declare' if is_number else 'give it, or give'} fewer that act alike"
+                f"{value:.4g} {descriptions.interval(low, high)}: these data do not tell it; move so that it matters, "
+                f"do not {'declare it, or declare' if is_number else 'give it, or give'} fewer that act alike"
             )
             found.append(Finding("undetermined", where, message))
     return found

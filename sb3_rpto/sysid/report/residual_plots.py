@@ -85,9 +85,9 @@ def residual_of(report: Report, effect: Effect) -> Picture | None:
     sign = ", times the direction of motion (below zero it brakes)" if level else ""
     caption = (
         f"Each dot is one sample of the {kind_of_runs(report)} runs: the force that the motion needed and the model "
-        f"does not know{sign}, {descriptions.means(report.data)}. The line joins medians: where it changes with {cause}, "
-        "something is missing; flat at zero, nothing is. On the left other effects are missing too, in the middle this "
-        "one alone. For the eye only: decisions are made on predictions."
+        f"does not know{sign}, {descriptions.means(report.data)}. The line joins medians: where it changes with "
+        f"{cause}, something is missing; flat at zero, nothing is. On the left other effects are missing too, "
+        "in the middle this one alone. For the eye only: decisions are made on predictions."
     )
     title = (
         f"{effect.label}: missing force of {descriptions.dof_name(model, dof)} against {cause}, RMS "
