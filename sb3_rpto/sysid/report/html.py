@@ -227,8 +227,8 @@ def _forces(report: Report) -> str:
         _note(
             f"The force that the motion needed and the model does not know, {descriptions.means(report.data)}, away "
             "from rest. Noise of differentiated positions, where there is some, is part of it. The learnable share is "
-            "what a small regressor predicts on unseen stretches: what a learned correction could still take away; none "
-            "is given where nothing but rounding is left."
+            "what a small regressor predicts on unseen stretches: what a learned correction could still take away; "
+            "none is given where nothing but rounding is left."
         ),
     ]
     shown = [residual_plots.residual_of(report, t.effect) for t in report.effects[:FIGURES]]
