@@ -91,7 +91,7 @@ def test_trace_robot_draws_by_seed(trace_robot):
 def test_robot_log_to_policy_goes_from_a_log_to_a_policy(monkeypatch, tmp_path, capsys):
     example = load("robot_log_to_policy", monkeypatch)
     monkeypatch.setattr(windows, "LONGEST", 0.005)
-    monkeypatch.setattr(importlib.import_module("sb3_rpto.sysid.problem.prepare"), "FEW", 12)
+    monkeypatch.setattr(importlib.import_module("sb3_rpto.sysid.problem.problem"), "FEW", 12)
     monkeypatch.setattr(sys, "argv", ["robot_log_to_policy.py", "--quick", "--out", str(tmp_path)])
     example.main()
     header = "time,qpos.slider,qpos.hinge,qpos.hinge2,qvel.slider,qvel.hinge,qvel.hinge2,ctrl.slide"

@@ -15,11 +15,11 @@ import numpy as np
 from benchmarks.tracing.planting import SYSTEMS, generate
 from sb3_rpto.evaluation import provenance
 from sb3_rpto.files import write_json
-from sb3_rpto.sysid.problem.prepare import prepare
-from sb3_rpto.sysid.selection.pipeline import aligned, fit_declared, worth_fitting
+from sb3_rpto.sysid.problem.problem import Inputs, prepare
 from sb3_rpto.sysid.selection.screening import screen
+from sb3_rpto.sysid.selection.search import SelectorPair, correct_for_discretisation, fit_declared, joint_candidates
 from sb3_rpto.sysid.selection.stepwise_selection import THRESHOLD
-from sb3_rpto.sysid.selection.threshold_calibration import LEVEL, strongest
+from sb3_rpto.sysid.selection.threshold_calibration import LEVEL, least_threshold
 
 NAME = "python -m benchmarks tracing threshold"
 #: Seeds of the sets begin here: those of the tracing benchmark are others.
@@ -84,11 +84,11 @@ def needed(system: str, noise: float, seed: int, episodes: int = 10, duration: f
     """
     start = time.process_time()
     made = generate(system, None, seed=seed, episodes=episodes, duration=duration, noise=noise)
-    set_up = prepare(made.xml, made.measurements, made.declared, seed, None, None, threads=1)
-    on = set_up.selectors(set_up.length, lambda share, what: None)
-    base = on.fine.model((), fit_declared(on.rough, seed), iterations=10)
-    chosen = worth_fitting(on.fine, screen(on.fine.train, base.fit))
-    t = strongest(aligned(on, base.fit.values).rough, base.fit, chosen)
+    problem = prepare(Inputs(made.xml, made.measurements, made.declared, seed=seed, threads=1))
+    on = SelectorPair.on(problem, problem.length)
+    base = on.fine.fit_model((), fit_declared(on.rough, seed), iterations=10)
+    chosen = joint_candidates(on.fine, screen(on.fine.train, base.fit))
+    t = least_threshold(correct_for_discretisation(on, base.fit.values).rough, base.fit, chosen)
     seconds = round(time.process_time() - start, 1)
     return {
         "system": system,

@@ -22,9 +22,10 @@ from sb3_rpto.envs.observations import env_name, layers, leaves_observations
 from sb3_rpto.envs.step_fidelity import beyond_states, observe
 from sb3_rpto.envs.task_rules import Rule, task_rules
 from sb3_rpto.sysid import Episode, Measurements
+from sb3_rpto.sysid.data.coordinates import straight
 from sb3_rpto.sysid.data.encoder_unwrapping import settle_turns
 from sb3_rpto.sysid.problem.data_model_consistency import check_clock, check_names
-from sb3_rpto.sysid.shooting.initial_states import HALF_COUNT, HALF_WIDTH, half_step, start_state, straight
+from sb3_rpto.sysid.shooting.initial_states import HALF_COUNT, HALF_WIDTH, half_step, start_state
 from sb3_rpto.sysid.shooting.windows import command_order, held, noise_levels
 
 #: Observation wrappers whose answer depends on more than the observation.

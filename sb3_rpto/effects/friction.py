@@ -40,7 +40,7 @@ class SoftFriction(CoulombFriction):
 
     It acts in the constraint that the model has (by default over ``solref`` of 0.02 s), so that a loaded joint creeps,
     as no machine's does: a trace looks for it where the robot seems to be simulated
-    (:func:`sb3_rpto.sysid.hypotheses.conclude.conclude`).
+    (:class:`sb3_rpto.sysid.hypotheses.soft_friction.SoftFriction`).
     """
 
     kind = "soft_friction"

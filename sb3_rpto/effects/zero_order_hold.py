@@ -2,7 +2,7 @@
 
 So does what is written to ``data.qfrc_applied`` before an environment steps, for all the substeps of that step. No
 machine does that: a trace looks for it where nothing else explains a simulator's states
-(:func:`sb3_rpto.sysid.hypotheses.conclude.conclude`).
+(:class:`sb3_rpto.sysid.hypotheses.held_forces.HeldForces`).
 """
 
 from dataclasses import replace

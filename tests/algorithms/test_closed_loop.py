@@ -36,8 +36,8 @@ from sb3_rpto.dynamics.weights import rto_weights
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Measurements, Report, trace
+from sb3_rpto.sysid.data.encoder_offsets import EncoderOffsets
 from sb3_rpto.sysid.data.signal_quality import Finding
-from sb3_rpto.sysid.hypotheses.encoder_offsets import Zeros
 
 TASK = "InvertedDoublePendulum-v5"
 KINDS = ["coulomb_friction", "torque_offset", "quadratic_drag"]
@@ -721,7 +721,9 @@ def test_a_new_target_is_traced_anew(soon: None) -> None:
     assert made.loop.due(made, dynamics(made))
 
 
-def explanation(effects: list[Effect], verdict: str = "explained", zeros: Zeros | None = None) -> SimpleNamespace:
+def explanation(
+    effects: list[Effect], verdict: str = "explained", zeros: EncoderOffsets | None = None
+) -> SimpleNamespace:
     """What a trace would report."""
     traced = tuple(SimpleNamespace(effect=e, label=e.label) for e in effects)
     ratio = SimpleNamespace(ratio=1.0)
@@ -811,7 +813,7 @@ def test_encoder_zeros_that_differ_by_run_are_taken_off_the_log(monkeypatch: pyt
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     runs = tuple(dict.fromkeys(episode.run for episode in measured.episodes))
 
-    def positions(zeros: Zeros | None) -> tuple[RPTO, np.ndarray]:
+    def positions(zeros: EncoderOffsets | None) -> tuple[RPTO, np.ndarray]:
         made = model([], target_data=measured)
         said = explanation([], zeros=zeros)
         monkeypatch.setattr(made.loop, "_trace", lambda *_: made.loop.found.append({"verdict": "explained"}) or said)  # type: ignore[union-attr,func-returns-value]
@@ -819,7 +821,7 @@ def test_encoder_zeros_that_differ_by_run_are_taken_off_the_log(monkeypatch: pyt
         return made, made.transitions("target").observations[:, 0].numpy()
 
     plain = positions(None)[1]
-    made, homed = positions(Zeros(("slider",), runs, np.full((len(runs), 1), 0.3), 0.5, 9.0))
+    made, homed = positions(EncoderOffsets(("slider",), runs, np.full((len(runs), 1), 0.3), 0.5, 9.0))
     np.testing.assert_allclose(plain - homed, 0.3, atol=1e-6)
     made.replay_buffer.target.reset()  # a checkpoint that is loaded without its buffers
     made.learn(4, reset_num_timesteps=False)

@@ -329,7 +329,7 @@ def quick(patch: pytest.MonkeyPatch) -> None:
     """Few windows and long steps in time: a trace of some seconds."""
     patch.setattr(source_buffer, "FILL", 50)
     patch.setattr(windows, "LONGEST", 0.005)
-    patch.setattr(importlib.import_module("sb3_rpto.sysid.problem.prepare"), "FEW", 8)
+    patch.setattr(importlib.import_module("sb3_rpto.sysid.problem.problem"), "FEW", 8)
 
 
 @cache

@@ -8,9 +8,9 @@ import pytest
 
 from sb3_rpto.sysid import Measurements
 from sb3_rpto.sysid.data.signal_quality import Finding
-from sb3_rpto.sysid.hypotheses.column_errors import misread, readings
-from sb3_rpto.sysid.problem.prepare import prepare
-from sb3_rpto.sysid.selection.pipeline import Found
+from sb3_rpto.sysid.hypotheses.column_errors import ColumnErrors, readings
+from sb3_rpto.sysid.problem.problem import Inputs, prepare
+from sb3_rpto.sysid.selection.search import SearchResult, SelectorPair
 from sb3_rpto.sysid.selection.stepwise_selection import Selection
 
 ARM = """
@@ -55,11 +55,12 @@ def misheard(tables: dict[str, dict[str, np.ndarray]], names: dict[str, str], si
 
 def found_in(data: Measurements) -> list[Finding]:
     """Of the declared model, fitted; nothing else is looked for."""
-    set_up = prepare(ARM, data, ["fore.mass"], seed=0, kinds=[], horizon=0.35, threads=1)
-    on = set_up.selectors(0.35, lambda share, what: None)
+    task = prepare(Inputs(ARM, data, ["fore.mass"], candidates=[], horizon=0.35, threads=1))
+    on = SelectorPair.on(task, 0.35)
     fit = on.fine.train.fit(on.fine.simulation.null, on.fine.free(()), iterations=5)
-    base = on.fine.model((), fit)
-    return misread(Found(on, base, None, None, Selection(base), None), set_up)  # type: ignore[arg-type]
+    base = on.fine.fit_model((), fit)
+    result = SearchResult(on, base, None, None, Selection(base), None)  # type: ignore[arg-type]
+    return ColumnErrors().hints(task, result, None)  # type: ignore[arg-type]
 
 
 EXCHANGED = {"qpos.shoulder": "qpos.elbow", "qpos.elbow": "qpos.shoulder"}

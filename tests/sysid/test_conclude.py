@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_rpto.effects import LIBRARY, Effect
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Measurements, trace
-from sb3_rpto.sysid.hypotheses import conclude
+from sb3_rpto.sysid.hypotheses.hypothesis import kept_effects
 
 OWN = """<mujoco><option timestep="0.005"/><worldbody><body name="pole">
 <joint name="hinge" axis="0 -1 0" damping="0.05"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="0.5"/>
@@ -42,19 +42,13 @@ def test_friction_that_gives_way_is_not_looked_for_where_no_dry_one_is() -> None
     assert [c.label for c in report.candidates] == ["torque_offset(hinge)"]
 
 
-def test_a_known_effect_that_the_fit_takes_away_is_not_in_what_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_known_effect_that_the_fit_takes_away_is_not_in_what_is_told_apart() -> None:
     known, found = LIBRARY["coulomb_friction"]("hinge", level=0.1).as_known(), LIBRARY["torque_offset"]("hinge")
     simulation = SimpleNamespace(effects=[known, found], slices=[slice(0, 1), slice(1, 2)])
     model = SimpleNamespace(effects=[1], fit=SimpleNamespace(values=np.array([0.0, 0.2])))
-    ended = SimpleNamespace(
-        selection=SimpleNamespace(model=model), on=SimpleNamespace(fine=SimpleNamespace(simulation=simulation))
-    )
-    given: list[Effect] = []
-    monkeypatch.setattr(conclude, "_explains", lambda _: False)
-    monkeypatch.setattr(conclude, "origin", lambda *args: given.extend(args[-1]) or "machine")
-    set_up = SimpleNamespace(nominal=None, fitted=None, sigma=None, length=None)
-    assert conclude._of_own_steps(set_up, ended, [], 1) is None  # type: ignore[arg-type]
-    assert [effect.label for effect in given] == ["torque_offset(hinge)"]
+    fine = SimpleNamespace(simulation=simulation)
+    result: Any = SimpleNamespace(selection=SimpleNamespace(model=model), on=SimpleNamespace(fine=fine))
+    assert [effect.label for effect in kept_effects(result)] == ["torque_offset(hinge)"]
 
 
 class Smooth(gym.Wrapper):

@@ -66,7 +66,7 @@ def test_correlations_are_exactly_symmetric_and_one_on_the_diagonal() -> None:
 def test_intervals_are_as_wide_as_the_curvature_of_the_loss_says(monkeypatch: pytest.MonkeyPatch) -> None:
     p = problem([CoulombFriction("hinge")], recorded([CoulombFriction("hinge", level=0.05)]))
     s = Selector(p, p, 3.5, lambda share, what: None)
-    selection, widths = Selection(s.model((0,), p.score(p.null))), []
+    selection, widths = Selection(s.fit_model((0,), p.score(p.null))), []
     for curvature in (1.0, 0.5):
         monkeypatch.setattr(Loss, "curvature", lambda loss, r, by=curvature: by)
         values, intervals, correlation = refit(selection, p)

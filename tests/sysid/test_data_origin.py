@@ -1,7 +1,5 @@
 """Recordings of a machine, and of a simulation in the model's own steps."""
 
-import importlib
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,6 +10,7 @@ from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Measurements, trace
 from sb3_rpto.sysid.problem.data_origin import may_be_exact, met_exactly, origin
+from sb3_rpto.sysid.problem.problem import Assumptions, Inputs, prepare
 
 #: semi-implicit steps of 5 ms err by far more than a tenth of a milliradian
 OWN = """<mujoco><option timestep="0.005"/><worldbody><body name="pole">
@@ -55,11 +54,11 @@ def test_own_steps_are_recognised_once_what_is_missing_is_found() -> None:
 
 
 def test_what_is_told_to_be_simulated_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    module = importlib.import_module("sb3_rpto.sysid.problem.prepare")
-    monkeypatch.setattr(module, "origin", lambda *_: pytest.fail("it was told"))
-    set_up = module.prepare(OWN, recorded([], compiled(OWN)), DECLARED, 0, [], 0.4, 1, simulated=True)
-    assert set_up.fitted.simulated
-    assert "simulated" not in [f.kind for f in set_up.findings]
+    monkeypatch.setattr("sb3_rpto.sysid.problem.problem.origin", lambda *_: pytest.fail("it was told"))
+    inputs = Inputs(OWN, recorded([], compiled(OWN)), DECLARED, candidates=[], horizon=0.4, threads=1)
+    task = prepare(inputs, Assumptions(simulated=True))
+    assert task.fitted.simulated
+    assert "simulated" not in [f.kind for f in task.findings]
 
 
 @pytest.mark.slow

@@ -1,6 +1,8 @@
 """What a reader is told beside a verdict."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -9,12 +11,12 @@ from simulated import PENDULUM, WITH_WHEEL, compiled, recorded
 
 from sb3_rpto.effects import LIBRARY, Simulation
 from sb3_rpto.effects.forces import Spring, TorqueOffset
-from sb3_rpto.sysid import Measurements, trace
+from sb3_rpto.sysid import Finding, Measurements, trace
+from sb3_rpto.sysid.hypotheses.finer_steps import FinerSteps
 from sb3_rpto.sysid.report.diagnostics import (
     above_noise,
     brief_delays,
     encoder_zeros,
-    finer_steps,
     missed,
     no_nearer,
     own_steps,
@@ -117,10 +119,16 @@ def test_transitions_of_finer_steps_than_the_models_are_told(step: float, told: 
     data = replace(Measurements.from_tables(tables), exact=True, simulated=True)
     own = Simulation(model, [], 1)
     problem = Problem(own, cut(model, data, noise_levels(data), 0.16, 20), [])
-    found = finer_steps(problem, own.null, np.empty(0, dtype=int), data, 0.16)
+
+    def hints(data: Measurements) -> list[Finding]:
+        task: Any = SimpleNamespace(fitted=data)
+        fit: Any = SimpleNamespace(problem=problem, values=own.null, free=np.empty(0, dtype=int), horizon=0.16)
+        return FinerSteps().hints(task, None, fit)  # type: ignore[arg-type]
+
+    found = hints(data)
     assert [f.kind for f in found] == ["time step"] * told
     assert not told or "with steps of 5 ms in place of 20 ms" in found[0].message
-    assert finer_steps(problem, own.null, np.empty(0, dtype=int), replace(data, exact=False), 0.16) == []
+    assert hints(replace(data, exact=False)) == []
 
 
 def named(actuator: str, torque: float = -3.75) -> list[str]:

@@ -114,7 +114,7 @@ def test_a_corrected_model_tells_the_zeros_of_other_runs() -> None:
 @pytest.mark.slow
 def test_a_joint_that_was_at_rest_says_nothing_of_new_zeros(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
-    monkeypatch.setattr("sb3_rpto.sysid.report.report.zeros_of", lambda *args: seen.append(args[2]))
+    monkeypatch.setattr("sb3_rpto.sysid.report.report.offsets_of", lambda *args: seen.append(args[2]))
     report = traced(0.0, 1.0)
     replace(report, data=replace(report.data, unobserved=("hinge",))).zeros_of(runs())
     assert seen[0].unobserved == ("hinge",)

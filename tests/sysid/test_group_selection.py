@@ -8,10 +8,10 @@ from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import Spring, TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, StribeckFriction, ViscousFriction
 from sb3_rpto.sysid.selection import group_selection, stepwise_selection
-from sb3_rpto.sysid.selection.group_selection import few_kinds
-from sb3_rpto.sysid.selection.pipeline import Selectors, search
+from sb3_rpto.sysid.selection.group_selection import select_groups
 from sb3_rpto.sysid.selection.screening import screen
-from sb3_rpto.sysid.selection.stepwise_selection import THRESHOLD, Model, Selection, Selector
+from sb3_rpto.sysid.selection.search import SelectorPair, select_effects
+from sb3_rpto.sysid.selection.stepwise_selection import Model, Selection, Selector
 
 #: rad that count as noise of exact data
 EXACT = 1e-6
@@ -32,16 +32,16 @@ STRIBECK, COULOMB, OFFSET, VISCOUS = range(4)
 def selector(planted: list[Effect], exact: bool = True, candidates: list[Effect] = CANDIDATES) -> Selector:
     data = recorded(planted, noise=0.0 if exact else 1e-3, exact=exact)
     train = problem(candidates, data, noise=EXACT if exact else 1e-3)
-    return Selector(train, None, THRESHOLD, lambda share, what: None)
+    return Selector(train, None)
 
 
 def base(s: Selector) -> Model:
-    return s.model((), s.train.score(s.train.null))
+    return s.fit_model((), s.train.score(s.train.null))
 
 
 def few(s: Selector) -> Model | None:
     begun = base(s).fit
-    return few_kinds(s, screen(s.train, begun), begun)
+    return select_groups(s, screen(s.train, begun), begun)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_the_simplest_kind_that_meets_exact_data_is_taken(planted: Effect, found
     model = few(s)
     assert model is not None
     assert model.effects == (found,)
-    assert s.met(model)
+    assert s.fits_exactly(model)
     assert model.fit.values[s.simulation.slices[found]] == pytest.approx(planted.values, rel=1e-4)
 
 
@@ -64,7 +64,7 @@ def test_two_kinds_meet_what_neither_does_alone(monkeypatch: pytest.MonkeyPatch)
     s = selector([CoulombFriction("hinge", level=0.08), TorqueOffset("hinge", offset=0.1)])
     model = few(s)
     assert model is not None
-    assert s.met(model)
+    assert s.fits_exactly(model)
     assert model.effects == (COULOMB, OFFSET)
     monkeypatch.setattr(group_selection, "MOST", 1)
     assert few(s) is None
@@ -84,45 +84,45 @@ def test_a_single_effect_that_meets_exact_data_ends_the_search_before_kinds_are_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     s = selector([CoulombFriction("hinge", level=0.08)])
-    monkeypatch.setattr("sb3_rpto.sysid.selection.pipeline.few_kinds", None)
+    monkeypatch.setattr("sb3_rpto.sysid.selection.search.select_groups", None)
     begun = base(s)
-    selection = search(Selectors(s, s, lambda share, what: None), begun, screen(s.train, begun.fit))
+    selection = select_effects(SelectorPair(s, s), begun, screen(s.train, begun.fit))
     assert selection.model.effects == (COULOMB,)
 
 
 @pytest.mark.slow
 def test_a_kind_that_meets_exact_data_ends_the_search_before_all_candidates_are_fitted_together() -> None:
     s = selector([CoulombFriction("hinge", level=0.08)])
-    s.look_forward = lambda selection, *_, **__: selection  # type: ignore[method-assign]
-    s.together = None  # type: ignore[method-assign, assignment]
+    s.add_effects = lambda selection, *_, **__: selection  # type: ignore[method-assign]
+    s.fit_together = None  # type: ignore[method-assign, assignment]
     begun = base(s)
-    selection = search(Selectors(s, s, lambda share, what: None), begun, screen(s.train, begun.fit))
+    selection = select_effects(SelectorPair(s, s), begun, screen(s.train, begun.fit))
     assert selection.model.effects == (COULOMB,)
 
 
 def test_noisy_data_are_never_met() -> None:
     s = selector([CoulombFriction("hinge", level=0.08)], exact=False)
-    model = s.model([COULOMB], base(s).fit)
+    model = s.fit_model([COULOMB], base(s).fit)
     assert np.median(model.errors) < 2
-    assert not s.met(model)
+    assert not s.fits_exactly(model)
 
 
 def test_driven_joints_are_a_kind_apart() -> None:
     model = compiled(WITH_WHEEL)
     effects = [CoulombFriction("axle"), CoulombFriction("hinge"), TorqueOffset("axle")]
-    s = Selector(problem(effects, recorded(model=model), model), None, THRESHOLD, lambda share, what: None)
-    assert list(s.by_kind([0, 1, 2], apart=True).values()) == [[0], [1], [2]]
-    assert list(s.by_kind([0, 1, 2]).values()) == [[0, 1], [2]]
+    s = Selector(problem(effects, recorded(model=model), model), None)
+    assert list(s.group_by_kind([0, 1, 2], apart=True).values()) == [[0], [1], [2]]
+    assert list(s.group_by_kind([0, 1, 2]).values()) == [[0, 1], [2]]
 
 
 def test_an_offset_that_a_bent_spring_cancels_is_dropped() -> None:
     """-k (q - r) - k r is -k q: both meet the data, and the spring alone does from its own reference."""
     s = selector([Spring("hinge", stiffness=0.5)], candidates=[Spring("hinge"), TorqueOffset("hinge")])
-    both = s.model((0, 1), s.train.score(np.array([0.5, 0.4, -0.2])))
-    assert s.met(both)
+    both = s.fit_model((0, 1), s.train.score(np.array([0.5, 0.4, -0.2])))
+    assert s.fits_exactly(both)
     alone = s.eliminate(Selection(both)).model
     assert alone.effects == (0,)
-    assert s.met(alone)
+    assert s.fits_exactly(alone)
     assert alone.fit.values == pytest.approx([0.5, 0.0, 0.0], abs=1e-5)
 
 
@@ -133,10 +133,10 @@ def test_a_kind_goes_as_a_whole_where_none_of_its_places_can_alone(monkeypatch: 
     candidates: list[Effect] = [Spring("hinge"), Spring("elbow"), TorqueOffset("hinge"), TorqueOffset("elbow")]
     model = compiled(WITH_FOREARM)
     train = problem(candidates, recorded(planted, noise=0.0, exact=True, model=model), model, noise=EXACT)
-    s = Selector(train, None, THRESHOLD, lambda share, what: None)
-    every = s.model((0, 1, 2, 3), s.train.score(np.array([0.5, 0.4, 0.5, -0.3, -0.2, 0.15])))
-    assert s.met(every)
+    s = Selector(train, None)
+    every = s.fit_model((0, 1, 2, 3), s.train.score(np.array([0.5, 0.4, 0.5, -0.3, -0.2, 0.15])))
+    assert s.fits_exactly(every)
     springs = s.eliminate(Selection(every)).model
     assert springs.effects == (0, 1)
-    assert s.met(springs)
+    assert s.fits_exactly(springs)
     assert springs.fit.values == pytest.approx([0.5, 0, 0.5, 0, 0, 0], abs=1e-4)

@@ -19,8 +19,7 @@ from sb3_rpto.effects.sensors import SensorBias, SensorDelay, SensorGain
 from sb3_rpto.fitting.loss import FAR, Loss
 from sb3_rpto.sysid import Measurements
 from sb3_rpto.sysid.shooting.initial_states import TRUST
-from sb3_rpto.sysid.shooting.interpolation import interpolate
-from sb3_rpto.sysid.shooting.multiple_shooting import CRUDE, RIDGE, UNSTABLE, Fit, Problem
+from sb3_rpto.sysid.shooting.multiple_shooting import CRUDE, RIDGE, UNSTABLE, Fit, Problem, interpolate
 
 DECLARED = ["hinge.damping", "pole.mass"]
 TRUE = np.array([0.08, 0.62])

@@ -6,7 +6,7 @@ import pytest
 
 from sb3_rpto.effects import Drive, Simulation
 from sb3_rpto.sysid import Measurements
-from sb3_rpto.sysid.problem.prepare import SHORTER, with_room
+from sb3_rpto.sysid.problem.problem import SHORTER, with_room
 from sb3_rpto.sysid.shooting.windows import discretised
 
 DELAYED = """<mujoco><option timestep="0.004"/><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size=".1"

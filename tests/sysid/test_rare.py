@@ -7,8 +7,8 @@ import pytest
 
 from sb3_rpto.effects.commands import CommandSaturation
 from sb3_rpto.sysid import Measurements
-from sb3_rpto.sysid.problem.prepare import prepare
-from sb3_rpto.sysid.selection.pipeline import fit_declared
+from sb3_rpto.sysid.problem.problem import Inputs, prepare
+from sb3_rpto.sysid.selection.search import SelectorPair, fit_declared
 from sb3_rpto.sysid.selection.stepwise_selection import Model, Selection
 
 MASS, DAMPING, GEAR, LIMIT, RATE, NOISE = 1.1, 0.6, 10.0, 0.5, 200, 1e-3
@@ -34,21 +34,22 @@ def driven(rng: np.random.Generator, burst: bool, duration: float = 2.5, steps: 
     return {"time": time, "qpos.rail": seen + NOISE * rng.standard_normal(count), "ctrl.motor": u}
 
 
-def look_forward() -> Model:
+def add_effects() -> Model:
     rng = np.random.default_rng(1)
     data = Measurements.from_tables({f"run{i:02}": driven(rng, burst=i % 3 == 0) for i in range(12)})
-    made = prepare(CART, data, ["rail.damping", "cart.mass"], 0, ["command_saturation"], None, 1, (), False)
-    selector = made.selectors(made.length, say=lambda share, what: None).rough
-    base = selector.model((), fit_declared(selector, 0))
+    declared = ["rail.damping", "cart.mass"]
+    task = prepare(Inputs(CART, data, declared, candidates=["command_saturation"], threads=1))
+    selector = SelectorPair.on(task, task.length).rough
+    base = selector.fit_model((), fit_declared(selector, 0))
     (limit,) = (i for i, e in enumerate(selector.simulation.effects) if not e.known)
-    return selector.look_forward(Selection(base), [limit]).model
+    return selector.add_effects(Selection(base), [limit]).model
 
 
 @pytest.mark.slow
 def test_a_limit_that_few_commands_reach_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    damping, mass, inverse = look_forward().fit.values
+    damping, mass, inverse = add_effects().fit.values
     assert 1 / inverse == pytest.approx(LIMIT, rel=0.02)
     assert (damping, mass) == pytest.approx((DAMPING, MASS), rel=0.05)
     # From no limit at all a fit sees only the one where screening looks: too low, it costs more than it saves.
     monkeypatch.setattr(CommandSaturation, "parameters", (replace(CommandSaturation.parameters[0], starts=()),))
-    assert look_forward().effects == ()
+    assert add_effects().effects == ()

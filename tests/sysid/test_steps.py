@@ -7,7 +7,7 @@ from simulated import briefly
 
 from sb3_rpto.sysid import Measurements, trace
 from sb3_rpto.sysid.problem.data_model_consistency import carried_weights, soft_friction, soft_ties
-from sb3_rpto.sysid.problem.prepare import SetUp
+from sb3_rpto.sysid.problem.problem import IdentificationProblem
 
 CRANK = """
 <mujoco><option timestep="0.002"/><worldbody><body name="crank">
@@ -88,7 +88,7 @@ def test_ties_that_give_way_are_said_to() -> None:
 
 @pytest.mark.slow
 def test_finer_steps_are_not_taken_where_the_model_is_adequate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(SetUp, "finer", lambda *_: pytest.fail("nothing is missing"))
+    monkeypatch.setattr(IdentificationProblem, "in_finer_steps", lambda *_: pytest.fail("nothing is missing"))
     model, rng, tables = mujoco.MjModel.from_xml_string(CRANK.format(friction="")), np.random.default_rng(0), {}
     model.opt.timestep = 2e-4
     for run in range(4):

@@ -17,8 +17,8 @@ from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, PositionFriction, QuadraticDrag, StribeckFriction
 from sb3_rpto.fitting.loss import FAR
 from sb3_rpto.sysid.selection.model_comparison import GAIN, Evidence, compare, folds
-from sb3_rpto.sysid.selection.pipeline import Selectors, aligned, search
 from sb3_rpto.sysid.selection.screening import screen
+from sb3_rpto.sysid.selection.search import SelectorPair, correct_for_discretisation, select_effects
 from sb3_rpto.sysid.selection.stepwise_selection import INSTEAD, LIKELY, ROUNDS, TENTH, Model, Selection, Selector
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit
 from sb3_rpto.sysid.shooting.windows import cut
@@ -31,13 +31,13 @@ def selector(planted: list[Effect], effects: list[Effect] | None = None, seed: i
     effects = effects or [CoulombFriction("hinge"), TorqueOffset("hinge"), QuadraticDrag("hinge")]
     train = problem(effects, recorded(planted, seed=seed))
     select = problem(effects, recorded(planted, seed=seed + 100))
-    return Selector(train, select, THRESHOLD, lambda share, what: None)
+    return Selector(train, select)
 
 
 def eliminated(s: Selector) -> Selection:
     count = range(len(s.simulation.effects))
-    base = s.model((), s.train.score(s.train.null))
-    full, _ = s.together(list(count), base.fit, base.fit)
+    base = s.fit_model((), s.train.score(s.train.null))
+    full, _ = s.fit_together(list(count), base.fit, base.fit)
     return s.eliminate(Selection(full), s.threshold)
 
 
@@ -186,14 +186,14 @@ def test_the_joint_fit_begins_again_from_kinds_that_do_no_better_alone(monkeypat
     monkeypatch.setattr(s, "_best_few", lambda *a: few)
     monkeypatch.setattr(s.train, "fit", lambda values, *a, **k: ends[values[0]])
     monkeypatch.setattr(s, "model", lambda effects, begin: Model(tuple(effects), begin, begin.errors))
-    model, _ = s.together([COULOMB, OFFSET, DRAG], base, fitted(0.0, 2.0, 40.0))
+    model, _ = s.fit_together([COULOMB, OFFSET, DRAG], base, fitted(0.0, 2.0, 40.0))
     assert model.fit is ends[1.0]
 
 
 def test_windows_left_out_do_not_lead_astray_what_hardly_shows() -> None:
     """Gravity that tilts along the axis of a hinge acts to second order: a straight line leads anywhere."""
     s = selector([CoulombFriction("hinge", level=0.08)], [CoulombFriction("hinge"), GravityTilt()], seed=1)
-    one = s.model([0], s.train.score(s.train.null))
+    one = s.fit_model([0], s.train.score(s.train.null))
     beside = one.fit.values + np.array([0.0, 0.002, 0.0])
     two = Model((0, 1), s.train.fit(beside, s.free([0, 1]), one.fit.starts), np.empty(0))
     errors = s._errors(two.fit, two.effects)
@@ -230,7 +230,7 @@ def test_nothing_is_kept_on_complete_data(seed: int) -> None:
 
 def test_judging_drops_what_does_not_help() -> None:
     s, kept = with_friction()
-    both = s.model([COULOMB, DRAG], kept.model.fit)
+    both = s.fit_model([COULOMB, DRAG], kept.model.fit)
     selection = s.judge(Selection(both))
     assert selection.model.effects == (COULOMB,)
     assert set(selection.evidence) == {COULOMB}
@@ -242,7 +242,7 @@ def test_judging_drops_what_does_not_help() -> None:
 def test_near_the_noise_evidence_must_be_clearer_far_from_it_the_gain_larger() -> None:
     s, kept = with_friction()
     assert s.limit(kept.model) == (THRESHOLD, GAIN)
-    far = s.model((), kept.model.fit)
+    far = s.fit_model((), kept.model.fit)
     assert np.median(far.errors) > FAR
     assert s.limit(far) == (LIKELY, TENTH)
 
@@ -254,10 +254,10 @@ def test_a_joint_fit_that_is_no_better_than_none_gives_way_to_the_best_few_kinds
     joint_stuck: bool, few_stuck: bool
 ) -> None:
     s = selector([CoulombFriction("hinge", level=0.08)])
-    base = s.model((), s.train.score(s.train.null))
+    base = s.fit_model((), s.train.score(s.train.null))
     rounds_taken: list[int] = []
     eliminated_from: list[tuple[int, ...]] = []
-    look, eliminate, together = s.look_forward, s.eliminate, s.together
+    look, eliminate, together = s.add_effects, s.eliminate, s.fit_together
 
     def looking(selection: Selection, candidates: list[int], rounds: int = ROUNDS, alike: Any = None) -> Selection:
         rounds_taken.append(rounds)
@@ -270,12 +270,12 @@ def test_a_joint_fit_that_is_no_better_than_none_gives_way_to_the_best_few_kinds
 
     def ending_badly(effects: list[int], fit: Fit, begin: Fit) -> tuple[Model, Model]:
         joint, _ = together(effects, fit, begin)
-        few = s.model([COULOMB, DRAG], fit)
+        few = s.fit_model([COULOMB, DRAG], fit)
         stuck = 2 * base.errors
         return replace(joint, errors=stuck) if joint_stuck else joint, replace(few, errors=stuck) if few_stuck else few
 
-    s.look_forward, s.eliminate, s.together = looking, eliminating, ending_badly  # type: ignore[method-assign]
-    selection = search(Selectors(s, s, lambda share, what: None), base, screen(s.train, base.fit))
+    s.add_effects, s.eliminate, s.fit_together = looking, eliminating, ending_badly  # type: ignore[method-assign]
+    selection = select_effects(SelectorPair(s, s), base, screen(s.train, base.fit))
     assert selection.model.effects == (COULOMB,)
     assert rounds_taken == [ROUNDS, INSTEAD if joint_stuck and few_stuck else ROUNDS]
     if not few_stuck:
@@ -284,24 +284,24 @@ def test_a_joint_fit_that_is_no_better_than_none_gives_way_to_the_best_few_kinds
 
 def test_where_a_single_effect_leaves_nothing_all_together_are_not_fitted() -> None:
     s = selector([CoulombFriction("hinge", level=0.08)])
-    base = s.model((), s.train.score(s.train.null))
-    s.together = None  # type: ignore[method-assign, assignment]
-    assert s.promise(base, [COULOMB, OFFSET, DRAG]) > 0.5
-    selection = search(Selectors(s, s, lambda share, what: None), base, screen(s.train, base.fit))
+    base = s.fit_model((), s.train.score(s.train.null))
+    s.fit_together = None  # type: ignore[method-assign, assignment]
+    assert s.predicted_gain(base, [COULOMB, OFFSET, DRAG]) > 0.5
+    selection = select_effects(SelectorPair(s, s), base, screen(s.train, base.fit))
     assert selection.model.effects == (COULOMB,)
-    assert s.promise(selection.model, [COULOMB, OFFSET, DRAG]) < GAIN
+    assert s.predicted_gain(selection.model, [COULOMB, OFFSET, DRAG]) < GAIN
 
 
 def test_of_effects_that_do_as_well_the_simpler_one_is_added() -> None:
     s = selector([CoulombFriction("hinge", level=0.08)], [StribeckFriction("hinge"), CoulombFriction("hinge")])
-    base = s.model((), s.train.score(s.train.null))
-    assert s.look_forward(Selection(base), [0, 1]).model.effects == (1,)
+    base = s.fit_model((), s.train.score(s.train.null))
+    assert s.add_effects(Selection(base), [0, 1]).model.effects == (1,)
 
 
 def test_one_of_its_class_may_take_the_place_of_what_is_added() -> None:
     s = selector([CoulombFriction("hinge", level=0.08)])
-    base = s.model((), s.train.score(s.train.null))
-    assert s.look_forward(Selection(base), [DRAG], rounds=1, alike=lambda e: [COULOMB]).model.effects == (COULOMB,)
+    base = s.fit_model((), s.train.score(s.train.null))
+    assert s.add_effects(Selection(base), [DRAG], rounds=1, alike=lambda e: [COULOMB]).model.effects == (COULOMB,)
 
 
 @pytest.mark.slow
@@ -311,8 +311,8 @@ def test_a_shape_that_hides_an_effect_is_left(monkeypatch: pytest.MonkeyPatch) -
 
     def found() -> Model:
         s = selector([there], [PositionFriction("hinge"), *declare(compiled(), ["hinge.damping"])])
-        base = s.model((), s.train.score(s.train.null), iterations=20)
-        return s.look_forward(Selection(base), [0]).model
+        base = s.fit_model((), s.train.score(s.train.null), iterations=20)
+        return s.add_effects(Selection(base), [0]).model
 
     np.testing.assert_allclose(found().fit.values, [*there.values, 0.05], rtol=0.1)
     phase = replace(PositionFriction.parameters[1], starts=())
@@ -330,24 +330,24 @@ def test_recordings_less_the_error_of_coarse_steps_are_met_by_them() -> None:
 
     def rough_or_fine(integrator: str) -> Selector:
         model = compiled(PENDULUM.replace("RK4", integrator))
-        return Selector(problem(effects, data, model, noise=1e-4), None, THRESHOLD, lambda share, what: None)
+        return Selector(problem(effects, data, model, noise=1e-4), None)
 
-    on = Selectors(rough_or_fine("RK4"), rough_or_fine("Euler"), lambda share, what: None)
+    on = SelectorPair(rough_or_fine("RK4"), rough_or_fine("Euler"), lambda share, what: None)
     null = on.fine.train.null
-    after = aligned(on, null)
+    after = correct_for_discretisation(on, null)
     assert after.fine is on.fine
     errors = [np.median(p.score(null).errors) for p in (on.fine.train, on.rough.train, after.rough.train)]
     assert errors[1] > 3 * errors[0]
     assert errors[2] == pytest.approx(errors[0], rel=0.2)
-    alike = Selectors(on.fine, on.fine, on.say)
-    assert aligned(alike, null) is alike
+    alike = SelectorPair(on.fine, on.fine, on.say)
+    assert correct_for_discretisation(alike, null) is alike
 
 
 def test_looking_forward_brings_a_wrongly_dropped_effect_back() -> None:
     s, _ = with_friction()
-    nothing = Selection(s.model((), s.train.score(s.train.null)))
+    nothing = Selection(s.fit_model((), s.train.score(s.train.null)))
     nothing.dropped[COULOMB] = (1, None)
-    found = s.look_forward(nothing, [COULOMB, OFFSET, DRAG])
+    found = s.add_effects(nothing, [COULOMB, OFFSET, DRAG])
     assert found.model.effects == (COULOMB,)
     assert COULOMB not in found.dropped
 
@@ -355,28 +355,28 @@ def test_looking_forward_brings_a_wrongly_dropped_effect_back() -> None:
 @pytest.mark.slow
 def test_a_larger_model_begins_at_the_smaller_ones_optimum_and_is_never_worse() -> None:
     s = selector([CoulombFriction("hinge", level=0.04), TorqueOffset("hinge", offset=0.02)], seed=5)
-    small = s.model((), s.train.score(s.train.null))
+    small = s.fit_model((), s.train.score(s.train.null))
     for grown in ([COULOMB], [COULOMB, OFFSET], [COULOMB, OFFSET, DRAG]):
-        large = s.model(grown, small.fit)
+        large = s.fit_model(grown, small.fit)
         assert large.fit.cost <= small.fit.cost * (1 + 1e-9)
         small = large
     # With no iteration to spend on it, it is the smaller one.
     fresh = Selector(s.train, s.select, THRESHOLD, s.say)
     begin = small.fit
-    assert fresh.model([COULOMB, OFFSET, DRAG], begin, iterations=1).fit.cost <= begin.cost * (1 + 1e-9)
+    assert fresh.fit_model([COULOMB, OFFSET, DRAG], begin, iterations=1).fit.cost <= begin.cost * (1 + 1e-9)
 
 
 def test_effects_that_are_not_in_a_model_are_at_their_null_in_it() -> None:
     s, selection = with_friction()
-    full = s.model([COULOMB, OFFSET, DRAG], selection.model.fit)
-    less = s.model([OFFSET], full.fit)
+    full = s.fit_model([COULOMB, OFFSET, DRAG], selection.model.fit)
+    less = s.fit_model([OFFSET], full.fit)
     np.testing.assert_array_equal(less.fit.values[[COULOMB, DRAG]], 0)
     assert less.effects == (OFFSET,)
 
 
 def test_the_planted_effects_removal_costs_most() -> None:
     s, selection = with_friction()
-    full = s.model([COULOMB, OFFSET, DRAG], selection.model.fit)
+    full = s.fit_model([COULOMB, OFFSET, DRAG], selection.model.fit)
     order, costs = s.removal_costs(full)
     assert order[-1] == COULOMB
     assert order == sorted(costs, key=costs.get)
@@ -385,7 +385,7 @@ def test_the_planted_effects_removal_costs_most() -> None:
 
 def test_the_cost_of_a_removal_is_that_of_the_fit_without_it_where_the_effect_is_small() -> None:
     s = selector([TorqueOffset("hinge", offset=0.001)], [TorqueOffset("hinge")], seed=7)
-    full = s.model([0], s.train.score(s.train.null), iterations=20)
+    full = s.fit_model([0], s.train.score(s.train.null), iterations=20)
     _, costs = s.removal_costs(full)
     less = s.train.fit(s.train.null, np.empty(0, dtype=int), full.fit.starts, iterations=20, tolerance=1e-6)
     assert costs[0] == pytest.approx(less.cost - full.fit.cost, rel=0.15)
@@ -393,7 +393,7 @@ def test_the_cost_of_a_removal_is_that_of_the_fit_without_it_where_the_effect_is
 
 def test_evidence_is_judged_on_the_select_windows_alone() -> None:
     s, selection = with_friction()
-    base = s.model((), s.train.score(s.train.null))
+    base = s.fit_model((), s.train.score(s.train.null))
     other = Selector(s.train, s.select, THRESHOLD, s.say)
     worse = replace(selection.model, errors=2 * base.errors)
     assert other.evidence(worse, base).gain == pytest.approx(1 - 2)
@@ -434,7 +434,7 @@ def test_a_fold_is_judged_as_by_a_fit_to_the_others() -> None:
     effects: list[Effect] = [CoulombFriction("hinge"), TorqueOffset("hinge")]
     p = problem(effects, recorded([CoulombFriction("hinge", level=0.05)], episodes=3, noise=2e-3), noise=2e-3)
     s = Selector(p, None, THRESHOLD, lambda share, what: None, 0.4)
-    full = s.model((0, 1), p.score(p.null), 20)
+    full = s.fit_model((0, 1), p.score(p.null), 20)
     assert len(s.folds) == 6
     expected, inside = [], []
     for others, judged in s.folds:
@@ -448,8 +448,8 @@ def test_a_fold_is_judged_as_by_a_fit_to_the_others() -> None:
     assert np.corrcoef(step, refit)[0, 1] > 0.95
     assert np.linalg.norm(step - refit) < 0.3 * np.linalg.norm(refit)
     assert refit.mean() > 0
-    assert s.evidence(full, s.model((1,), full.fit)).clear(THRESHOLD)
-    assert not s.evidence(full, s.model((0,), full.fit)).clear(THRESHOLD)
+    assert s.evidence(full, s.fit_model((1,), full.fit)).clear(THRESHOLD)
+    assert not s.evidence(full, s.fit_model((0,), full.fit)).clear(THRESHOLD)
 
 
 def test_noisy_data_are_not_exact() -> None:

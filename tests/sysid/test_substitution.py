@@ -8,18 +8,18 @@ from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.friction import CoulombFriction, SoftFriction, StribeckFriction, ViscousFriction
 from sb3_rpto.sysid import trace
 from sb3_rpto.sysid.selection.screening import screen
-from sb3_rpto.sysid.selection.stepwise_selection import THRESHOLD, Selection, Selector
-from sb3_rpto.sysid.selection.substitution import Likes
+from sb3_rpto.sysid.selection.stepwise_selection import Selection, Selector
+from sb3_rpto.sysid.selection.substitution import Substitution
 
 
 def test_substitution_replaces_a_wrong_effect_by_the_right_one() -> None:
     effects: list[Effect] = [CoulombFriction("hinge"), ViscousFriction("hinge")]
     planted = [CoulombFriction("hinge", level=0.08)]
     train, unseen = (problem(effects, recorded(planted, seed=seed)) for seed in (2, 102))
-    s = Selector(train, unseen, THRESHOLD, lambda share, what: None)
+    s = Selector(train, unseen)
     nothing = train.score(train.null)
-    wrong = s.model([1], nothing, 12)
-    found = Likes(s, screen(train, nothing)).substitute(Selection(wrong))
+    wrong = s.fit_model([1], nothing, 12)
+    found = Substitution(s, screen(train, nothing)).substitute(Selection(wrong))
     assert found.model.effects == (0,)
     assert found.alike[0] == []  # the wrong one is clearly worse, and so of no class with it
 
@@ -29,9 +29,9 @@ def test_what_does_as_well_is_of_the_class() -> None:
     effects: list[Effect] = [CommandDelay("motor"), ActuatorLag("motor")]
     planted = [ActuatorLag("motor", time_constant=0.004)]
     train, unseen = (problem(effects, recorded(planted, noise=5e-3, seed=seed)) for seed in (2, 102))
-    s = Selector(train, unseen, THRESHOLD, lambda share, what: None)
+    s = Selector(train, unseen)
     nothing = train.score(train.null)
-    found = Likes(s, screen(train, nothing)).substitute(Selection(s.model([0], nothing, 12)))
+    found = Substitution(s, screen(train, nothing)).substitute(Selection(s.fit_model([0], nothing, 12)))
     (kept,) = found.model.effects
     assert found.alike[kept] == [1 - kept]
 
@@ -63,28 +63,28 @@ def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
     """A Stribeck friction that has come near a Coulomb's path errs less than a Coulomb's first fit."""
     effects: list[Effect] = [CoulombFriction("hinge"), StribeckFriction("hinge")]
     data = recorded([CoulombFriction("hinge", level=0.08)], noise=0.0, exact=True)
-    s = Selector(problem(effects, data, noise=1e-5), None, THRESHOLD, lambda share, what: None)
+    s = Selector(problem(effects, data, noise=1e-5), None)
     assert s.train.exact
-    found = screen(s.train, s.model((), s.train.score(s.train.null)).fit)
+    found = screen(s.train, s.fit_model((), s.train.score(s.train.null)).fit)
     assert found.alike(1) == [0]
-    rich = s.led_on(s.model([1], s.train.fit(s.train.null, s.free([1]))))
-    assert not s.far(rich)
-    assert Likes(s, found).simplest(rich, Selection(rich)).effects == (0,)
+    rich = s.refine(s.fit_model([1], s.train.fit(s.train.null, s.free([1]))))
+    assert not s.model_error_dominates(rich)
+    assert Substitution(s, found).prefer_simplest(rich, Selection(rich)).effects == (0,)
 
 
 def test_of_two_that_meet_exact_data_the_one_that_errs_far_less_is_right() -> None:
     """A friction that gives way for a moment is a Coulomb's within the tolerance of exact data."""
     effects: list[Effect] = [CoulombFriction("hinge"), SoftFriction("hinge")]
     data = recorded([SoftFriction("hinge", level=0.08)], noise=0.0, exact=True)
-    s = Selector(problem(effects, data, noise=4e-3), None, THRESHOLD, lambda share, what: None)
+    s = Selector(problem(effects, data, noise=4e-3), None)
     nothing = s.train.score(s.train.null)
-    dry, soft = (s.led_on(s.model([i], nothing, 12)) for i in (0, 1))
-    assert s.met(dry)
-    assert s.met(soft)
-    found = Likes(s, screen(s.train, nothing)).substitute(Selection(dry))
+    dry, soft = (s.refine(s.fit_model([i], nothing, 12)) for i in (0, 1))
+    assert s.fits_exactly(dry)
+    assert s.fits_exactly(soft)
+    found = Substitution(s, screen(s.train, nothing)).substitute(Selection(dry))
     assert found.model.effects == (1,)
     assert found.alike[1] == [0]
-    again = Likes(s, screen(s.train, nothing)).substitute(Selection(soft))
+    again = Substitution(s, screen(s.train, nothing)).substitute(Selection(soft))
     assert again.model.effects == (1,)
 
 
@@ -94,11 +94,11 @@ def test_one_takes_the_place_of_two_where_its_first_fit_had_failed() -> None:
     effects: list[Effect] = [CoulombFriction("hinge"), ViscousFriction("hinge"), StribeckFriction("hinge")]
     planted = [CoulombFriction("hinge", level=0.08)]
     train, unseen = (problem(effects, recorded(planted, noise=5e-3, seed=seed), noise=5e-3) for seed in (2, 102))
-    s = Selector(train, unseen, THRESHOLD, lambda share, what: None)
+    s = Selector(train, unseen)
     nothing = train.score(train.null)
-    both = s.model([1, 2], nothing, 12)
+    both = s.fit_model([1, 2], nothing, 12)
     s._remembered((0,), nothing)  # as of a search that had ended elsewhere
-    found = Likes(s, screen(train, nothing)).merge(Selection(both, alike={1: [0]}))
+    found = Substitution(s, screen(train, nothing)).merge(Selection(both, alike={1: [0]}))
     assert found.model.effects == (0,)
     assert found.model.fit.values[0] == pytest.approx(0.08, rel=0.05)
 
@@ -119,10 +119,10 @@ def test_joints_are_built_alike(kept: tuple[int, ...]) -> None:
     effects: list[Effect] = [kind(j) for kind in (CoulombFriction, ViscousFriction) for j in joints]
     there = [CoulombFriction(j, level=level) for j, level in zip(joints, (0.1, 0.06, 0.03))]
     data = recorded(there, model, noise=0.0, exact=True)
-    s = Selector(problem(effects, data, noise=1e-5, model=model), None, THRESHOLD, lambda share, what: None)
-    found = screen(s.train, s.model((), s.train.score(s.train.null)).fit)
-    wrong = s.model(kept, s.train.fit(s.train.null, s.free(kept)))
+    s = Selector(problem(effects, data, noise=1e-5, model=model), None)
+    found = screen(s.train, s.fit_model((), s.train.score(s.train.null)).fit)
+    wrong = s.fit_model(kept, s.train.fit(s.train.null, s.free(kept)))
     if 0 in kept:
-        assert Likes(s, found).uniform(wrong, Selection(wrong)).effects == (0, 1, 2)
+        assert Substitution(s, found).make_uniform(wrong, Selection(wrong)).effects == (0, 1, 2)
     else:
-        assert Likes(s, found).substitute(Selection(wrong)).model.effects == (0, 1, 2)
+        assert Substitution(s, found).substitute(Selection(wrong)).model.effects == (0, 1, 2)

@@ -24,9 +24,10 @@ from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, ViscousFriction
 from sb3_rpto.effects.library import given
 from sb3_rpto.sysid import Measurements, Report, trace
-from sb3_rpto.sysid.problem.prepare import LONGER, SetUp, prepare
+from sb3_rpto.sysid.problem.problem import LONGER, Assumptions, IdentificationProblem, Inputs, prepare
 from sb3_rpto.sysid.report.diagnostics import at_bounds
 from sb3_rpto.sysid.selection.adequacy import Adequacy, judge
+from sb3_rpto.sysid.selection.search import SelectorPair
 
 #: the longest steps that the recording and the trace may have
 COARSE = PENDULUM.replace('timestep="0.005"', 'timestep="0.01"')
@@ -247,11 +248,10 @@ def test_where_much_is_left_to_explain_longer_windows_are_looked_at() -> None:
 def test_longer_windows_begin_where_the_others_do() -> None:
     """Laid side by side they are half as many, and what acts little no longer shows in them."""
     data = recorded([], compiled(COARSE), 9, 3.2, rate=50)
-    made = prepare(COARSE, data, ["hinge.damping"], 0, ["coulomb_friction"], None, 1, simulated=True)
+    inputs = Inputs(COARSE, data, ["hinge.damping"], candidates=["coulomb_friction"], threads=1)
+    made = prepare(inputs, Assumptions(simulated=True))
     assert made.longer == LONGER * made.length
-    usual, longer = (
-        made.selectors(length, lambda share, what: None).fine.train.windows for length in (made.length, made.longer)
-    )
+    usual, longer = (SelectorPair.on(made, length).fine.train.windows for length in (made.length, made.longer))
     assert {tuple(q) for q in longer.qpos.round(9)} < {tuple(q) for q in usual.qpos.round(9)}
     assert len(longer) > 0.75 * len(usual)  # all but the last of each run
 
@@ -509,11 +509,11 @@ def test_a_calibrated_threshold_is_the_one_that_selects(
 ) -> None:
     asked = []
 
-    def calibrated(selector: Any, base: Any, chosen: list[int], sets: int, seed: int) -> float:
+    def calibrate_threshold(selector: Any, base: Any, chosen: list[int], sets: int, seed: int) -> float:
         asked.append((len(selector.train.simulation.effects), chosen, sets, seed))
         return threshold
 
-    monkeypatch.setattr("sb3_rpto.sysid.selection.pipeline.calibrated", calibrated)
+    monkeypatch.setattr("sb3_rpto.sysid.selection.search.calibrate_threshold", calibrate_threshold)
     data = recorded([CoulombFriction("hinge", level=0.08)], model=compiled(COARSE), rate=100)
     settings: dict[str, Any] = {"candidates": ["coulomb_friction"], "horizon": 0.35, "threads": 1}
     with coarsely(0.01):
@@ -535,14 +535,14 @@ def test_what_is_no_whole_number_is_refused(name: str, wrong: Any) -> None:
 def test_how_test_runs_were_sampled_changes_nothing_of_the_fit() -> None:
     made = planted(("coulomb_friction", "large"))
 
-    def fitted_with(speed: float) -> SetUp:
+    def fitted_with(speed: float) -> IdentificationProblem:
         # Most of the samples are the test runs'.
         episodes = [
             replace(e, part="test", time=e.time / speed) if i < 4 else replace(e, part="train")
             for i, e in enumerate(made.measurements.episodes)
         ]
         data = replace(made.measurements, episodes=episodes)
-        return prepare(made.xml, data, made.declared, 0, NATIVE, None, 1)
+        return prepare(Inputs(made.xml, data, made.declared, candidates=NATIVE, threads=1))
 
     ours, theirs = fitted_with(1.0), fitted_with(20.0)
     for name in ("fine", "rough"):

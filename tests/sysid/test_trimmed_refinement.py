@@ -14,7 +14,7 @@ from sb3_rpto.sysid import Measurements, trace
 from sb3_rpto.sysid.problem.inverse_dynamics import force_residuals, typical
 from sb3_rpto.sysid.shooting import trimmed_refinement
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
-from sb3_rpto.sysid.shooting.trimmed_refinement import ENOUGH, HOPS, WORTH, concentrated, lengthened
+from sb3_rpto.sysid.shooting.trimmed_refinement import ENOUGH, HOPS, WORTH, fit_lengthening, fit_trimmed
 from sb3_rpto.sysid.shooting.windows import cut, discretised, noise_levels
 
 pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute")
@@ -58,7 +58,7 @@ def test_a_walkers_lengths_are_found_where_contacts_hold_a_plain_fit() -> None:
     free = np.arange(len(TRUE))
     true = problem.null * TRUE
     plain = problem.fit(problem.null, free, iterations=100, tolerance=1e-9)
-    led = concentrated(problem, plain, free)
+    led = fit_trimmed(problem, plain, free)
     assert problem.score(true).errors.max() < 1e-6  # the truth is there to be found
     assert plain.errors.max() > 10 * ENOUGH  # and a descent does not get there
     assert led.errors.max() < ENOUGH
@@ -93,23 +93,23 @@ def test_a_spring_about_a_far_angle_is_reached_by_windows_that_grow() -> None:
     free = np.arange(5)
     plain = on.fit(begin, free, iterations=40)
     assert plain.errors.max() > 100 * ENOUGH
-    led = lengthened(on, plain, free)
+    led = fit_lengthening(on, plain, free)
     assert led.errors.max() < ENOUGH
     assert led.values[3:] == pytest.approx([0.3, -2.5], rel=1e-4)
-    assert lengthened(on, led, free) is led
-    assert lengthened(on, plain, free[:0]) is plain
+    assert fit_lengthening(on, led, free) is led
+    assert fit_lengthening(on, plain, free[:0]) is plain
 
 
 def test_a_fit_near_the_noise_stays() -> None:
     problem = lengths()
     fit = problem.score(problem.null * TRUE)
-    assert concentrated(problem, fit, np.arange(len(TRUE))) is fit
+    assert fit_trimmed(problem, fit, np.arange(len(TRUE))) is fit
 
 
 def test_a_fit_without_free_parameters_stays() -> None:
     problem = lengths()
     fit = problem.score(problem.null)
-    assert concentrated(problem, fit, np.empty(0, dtype=int)) is fit
+    assert fit_trimmed(problem, fit, np.empty(0, dtype=int)) is fit
 
 
 @pytest.mark.slow
@@ -118,7 +118,7 @@ def test_it_never_ends_higher_than_it_began(seed: int) -> None:
     problem = lengths()
     few = problem.on(np.arange(seed, len(problem.windows), 5))
     begin = few.score(problem.null * np.random.default_rng(seed).uniform(0.8, 1.2, len(TRUE)))
-    assert concentrated(few, begin, np.arange(4)).cost <= begin.cost
+    assert fit_trimmed(few, begin, np.arange(4)).cost <= begin.cost
 
 
 def test_a_parameter_that_shows_nowhere_goes_back_to_where_it_may_show() -> None:
@@ -131,19 +131,19 @@ def test_a_parameter_that_shows_nowhere_goes_back_to_where_it_may_show() -> None
     problem = Problem(simulation, cut(model, data, noise_levels(data), HORIZON, 40), scales)
     hidden = problem.null * [0.5, 1.0]
     assert problem.fit(hidden, np.arange(2)).values[0] == hidden[0]
-    led = concentrated(problem, problem.score(hidden), np.arange(2))
+    led = fit_trimmed(problem, problem.score(hidden), np.arange(2))
     np.testing.assert_allclose(led.values, problem.null * true, rtol=1e-4)
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Costs of the fits that would be concentrated; none is."""
+    """Costs of the fits that would be fit_trimmed; none is."""
     costs: list[float] = []
 
     def seen(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
         costs.append(fit.cost)
         return fit
 
-    monkeypatch.setattr(trimmed_refinement, "concentrated", seen)
+    monkeypatch.setattr(trimmed_refinement, "fit_trimmed", seen)
     return costs
 
 
@@ -155,13 +155,13 @@ def test_exact_data_that_still_err_are_fitted_anew_beside_the_best_until_that_do
     monkeypatch.setattr(trimmed_refinement, "ENOUGH", 0.0)
     problem = lengths().on(np.arange(0, 40, 4))
     free = np.arange(len(TRUE))
-    led = trimmed_refinement.led_on(problem, problem.fit(problem.null, free, iterations=20), free)
+    led = trimmed_refinement.refine(problem, problem.fit(problem.null, free, iterations=20), free)
     best = np.minimum.accumulate(costs)
     paid = np.array(costs[1:]) < WORTH * best[:-1]
     assert led.cost == min(costs)
     assert not paid[-HOPS:].any()
     assert all(paid[k : k + HOPS].any() for k in range(len(paid) - HOPS))
-    assert trimmed_refinement.led_on(problem, problem.fit(problem.null, free, iterations=20), free).cost == led.cost
+    assert trimmed_refinement.refine(problem, problem.fit(problem.null, free, iterations=20), free).cost == led.cost
 
 
 def test_noisy_data_are_not_fitted_anew(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,5 +169,5 @@ def test_noisy_data_are_not_fitted_anew(monkeypatch: pytest.MonkeyPatch) -> None
     noisy = problem(declare(compiled(), ["pole.mass"]), recorded([], noise=1e-3), noise=1e-3)
     far = noisy.score(2 * noisy.null)
     assert far.errors.max() > ENOUGH
-    assert trimmed_refinement.led_on(noisy, far, np.arange(1)) is far
+    assert trimmed_refinement.refine(noisy, far, np.arange(1)) is far
     assert len(costs) == 1

@@ -10,10 +10,10 @@ from simulated import PENDULUM, recorded
 
 from benchmarks.tracing.planting import generate
 from sb3_rpto.sysid import trace
-from sb3_rpto.sysid.hypotheses.undeclared_mass import undeclared_mass
-from sb3_rpto.sysid.problem.prepare import prepare
+from sb3_rpto.sysid.hypotheses.undeclared_mass import UndeclaredMass
+from sb3_rpto.sysid.problem.problem import Inputs, prepare
 from sb3_rpto.sysid.report.descriptions import VERDICTS, verdict
-from sb3_rpto.sysid.selection.pipeline import Found, Selection
+from sb3_rpto.sysid.selection.search import SearchResult, Selection, SelectorPair
 
 
 @pytest.mark.parametrize(
@@ -27,12 +27,13 @@ def test_a_mass_is_not_named_for_what_fitting_the_declared_numbers_does(
     damping: float, mass: float, bodies: list[str]
 ) -> None:
     xml = PENDULUM.replace('mass="0.5"', f'mass="{mass}"').replace('damping="0.05"', f'damping="{damping}"')
-    set_up = prepare(xml, recorded(), ["hinge.damping"], 0, [], 0.35, 1)
-    on = set_up.selectors(0.35, lambda share, what: None)
+    task = prepare(Inputs(xml, recorded(), ["hinge.damping"], candidates=[], horizon=0.35, threads=1))
+    on = SelectorPair.on(task, 0.35)
     fit = on.fine.train.fit(on.fine.simulation.null, on.fine.free(()), iterations=1)
-    base = on.fine.model((), fit)
+    base = on.fine.fit_model((), fit)
     base = replace(base, fit=replace(base.fit, values=on.fine.simulation.null))  # not fitted as well as it may be
-    hints = undeclared_mass(Found(on, base, None, None, Selection(base), None), set_up)  # type: ignore[arg-type]
+    result = SearchResult(on, base, None, None, Selection(base), None)  # type: ignore[arg-type]
+    hints = UndeclaredMass().hints(task, result, None)  # type: ignore[arg-type]
     assert [hint.where for hint in hints] == bodies
     for hint in hints:
         assert float(hint.message.split()[1]) == pytest.approx(0.5 / mass, rel=0.02)
@@ -57,9 +58,10 @@ def test_a_mass_that_was_not_declared_is_named_with_its_size() -> None:
 
 
 def test_candidates_that_the_model_has_no_place_for_are_named() -> None:
-    set_up = prepare(PENDULUM, recorded(), ["hinge.damping"], 0, ["wind", "spring", "wind"], 0.35, 1)
-    assert [finding.where for finding in set_up.findings if finding.kind == "no place"] == ["wind"]
-    assert [effect.kind for effect in set_up.fine.effects] == ["declared", "spring"]
+    kinds = ["wind", "spring", "wind"]
+    task = prepare(Inputs(PENDULUM, recorded(), ["hinge.damping"], candidates=kinds, horizon=0.35, threads=1))
+    assert [finding.where for finding in task.findings if finding.kind == "no place"] == ["wind"]
+    assert [effect.kind for effect in task.fine.effects] == ["declared", "spring"]
 
 
 def test_where_nothing_was_looked_for_the_verdict_does_not_say_it_was() -> None:

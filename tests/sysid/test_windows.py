@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sb3_rpto.sysid.problem.prepare import at_rest
 from simulated import PENDULUM, compiled, recorded
 
 from sb3_rpto.effects import Drive, Simulation
 from sb3_rpto.effects.commands import Backlash
 from sb3_rpto.effects.names import object_id
 from sb3_rpto.sysid import Measurements
-from sb3_rpto.sysid.problem.prepare import at_rest
-from sb3_rpto.sysid.shooting.interpolation import interpolate
+from sb3_rpto.sysid.shooting.multiple_shooting import interpolate
 from sb3_rpto.sysid.shooting.windows import ENOUGH_BLOCKS, EXACT, REVERSALS, cut, discretised, noise_levels, reversals
 
 SIGMA = np.array([1e-3])

@@ -22,9 +22,9 @@ from sb3_rpto.effects import Declared, from_json
 from sb3_rpto.envs.env_copy import copy_env
 from sb3_rpto.envs.observations import single_env
 from sb3_rpto.sysid import Measurements, Report, trace
-from sb3_rpto.sysid.hypotheses.encoder_offsets import Zeros
+from sb3_rpto.sysid.data.encoder_offsets import EncoderOffsets
 from sb3_rpto.sysid.problem.contacts import OFTEN, contact_changes
-from sb3_rpto.sysid.problem.prepare import Progress
+from sb3_rpto.sysid.problem.problem import Progress
 from sb3_rpto.sysid.selection.adequacy import SETTLED
 from sb3_rpto.sysid.shooting.windows import noise_levels
 
@@ -85,7 +85,7 @@ class LoopCloser:
         #: whether the simulator accounts for the target by the last trace, so that it may judge policies
         self.accounts = False
         #: encoder zeros that differ by run in the robot's log that was traced; None where none do
-        self.zeros: Zeros | None = None
+        self.zeros: EncoderOffsets | None = None
         #: whether a robot's log was traced that holds no transition of the task
         self.log_is_empty = False
         #: of the policy in the simulator as it is fitted

@@ -28,10 +28,10 @@ from sb3_rpto.envs.observations import (
 )
 from sb3_rpto.sysid.data import signal_quality
 from sb3_rpto.sysid.data.columns import Columns, columns_of, joint_of
+from sb3_rpto.sysid.data.coordinates import turning
 from sb3_rpto.sysid.data.measurements import Measurements, Noise
 from sb3_rpto.sysid.data.recording import Episode
 from sb3_rpto.sysid.data.signal_quality import Finding
-from sb3_rpto.sysid.shooting.initial_states import turning
 
 MIN_TRANSITIONS = 2
 #: Draws from which the noise of states follows from that of observations.

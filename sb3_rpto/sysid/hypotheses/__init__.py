@@ -1,1 +1,1 @@
-"""Other ways to read recordings that a search does not explain."""
+"""Other ways to read recordings, tried in one list, and hints at what may be wrong where none explains them."""

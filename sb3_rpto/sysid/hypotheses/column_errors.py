@@ -14,9 +14,12 @@ from sb3_rpto.effects.names import SCALAR_JOINTS, object_names
 from sb3_rpto.sysid.data.columns import Columns, joint_of
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
-from sb3_rpto.sysid.problem.prepare import SetUp
+from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
+from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.problem.unsupported_elements import Hint
-from sb3_rpto.sysid.selection.pipeline import Found
+from sb3_rpto.sysid.selection.confidence_intervals import FinalFit
+from sb3_rpto.sysid.selection.search import SearchResult
 from sb3_rpto.sysid.shooting.multiple_shooting import START_STEPS, Problem
 from sb3_rpto.sysid.shooting.windows import cut
 
@@ -96,37 +99,40 @@ def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
             yield Reading("reversed", where, what, remedy, _reversed(i, speed, motors[i]), positions, (name,))
 
 
-def misread(found: Found, set_up: SetUp) -> list[Hint]:
-    """The way of reading by which the model errs far less, with what was found for it as far as that is needed then."""
-    data, train = set_up.fitted, found.on.fine.train
-    simulation, horizon, model = train.simulation, found.on.fine.horizon, found.selection.model
-    free = found.on.fine.free(model.effects)
+class ColumnErrors(Hypothesis):
+    """The recordings were logged otherwise than they say."""
 
-    def problem(again: Callable[[Episode], Episode], order: Sequence[int]) -> Problem:
-        read = replace(data, episodes=[again(episode) for episode in data.episodes])
-        windows = cut(simulation.model, read, set_up.sigma[list(order)], horizon, WINDOWS)
-        return Problem(simulation, windows, train.scales)
+    def hints(self, problem: IdentificationProblem, result: SearchResult, fit: FinalFit) -> list[Finding]:
+        """The way of reading by which the model errs far less, with what was found for it as far as that is needed."""
+        data, selector, model = problem.fitted, result.on.fine, result.selection.model
+        simulation, scales, free = selector.simulation, selector.train.scales, selector.free(model.effects)
 
-    # The declared numbers alone may promise more: what was found makes up for the way of reading.
-    begins = (model.fit.values, found.base.fit.values)
-    as_read = problem(lambda episode: episode, range(len(set_up.sigma)))
-    usual = float(np.median(as_read.score(begins[0], iterations=START_STEPS).errors))
-    tried = []
-    for reading in readings(set_up.nominal, data):
-        there = problem(reading.again, reading.order)
-        errors = [float(np.median(there.score(values).errors)) for values in begins]
-        tried.append((min(errors), begins[int(np.argmin(errors))], there, reading))
-    fitted = []
-    for _, values, there, reading in sorted(tried, key=lambda one: one[0])[:FITTED]:
-        fit = there.fit(values, free, iterations=ITERATIONS)
-        fitted.append((float(np.median(fit.errors)) / usual, reading))
-    share, best = min(fitted, key=lambda one: one[0], default=(np.inf, None))
-    if best is None or share > CLEARLY:
-        return []
-    message = f"{best.what} the model errs by {share:.0%} of what it does: {best.remedy} and trace again"
-    names = object_names(set_up.nominal, "joint")
-    bodies = frozenset(int(set_up.nominal.jnt_bodyid[names.index(joint)]) for joint in best.joints)
-    return [Hint(best.kind, best.where, message, bodies=bodies or None, left=share)]
+        def read(again: Callable[[Episode], Episode], order: Sequence[int]) -> Problem:
+            episodes = [again(episode) for episode in data.episodes]
+            noise = problem.sigma[list(order)]
+            windows = cut(simulation.model, replace(data, episodes=episodes), noise, selector.horizon, WINDOWS)
+            return Problem(simulation, windows, scales)
+
+        # The declared numbers alone may promise more: what was found makes up for the way of reading.
+        begins = (model.fit.values, result.base.fit.values)
+        as_read = read(lambda episode: episode, range(len(problem.sigma)))
+        usual = float(np.median(as_read.score(begins[0], iterations=START_STEPS).errors))
+        tried = []
+        for reading in readings(problem.nominal, data):
+            there = read(reading.again, reading.order)
+            errors = [float(np.median(there.score(values).errors)) for values in begins]
+            tried.append((min(errors), begins[int(np.argmin(errors))], there, reading))
+        fitted = []
+        for _, values, there, reading in sorted(tried, key=lambda one: one[0])[:FITTED]:
+            tuned = there.fit(values, free, iterations=ITERATIONS)
+            fitted.append((float(np.median(tuned.errors)) / usual, reading))
+        share, best = min(fitted, key=lambda one: one[0], default=(np.inf, None))
+        if best is None or share > CLEARLY:
+            return []
+        message = f"{best.what} the model errs by {share:.0%} of what it does: {best.remedy} and trace again"
+        names = object_names(problem.nominal, "joint")
+        bodies = frozenset(int(problem.nominal.jnt_bodyid[names.index(joint)]) for joint in best.joints)
+        return [Hint(best.kind, best.where, message, bodies=bodies or None, left=share)]
 
 
 def _exchanged(count: int, i: int, j: int) -> list[int]:

@@ -14,10 +14,10 @@ from sb3_rpto.effects import Declared, Effect, Scales, Simulation
 from sb3_rpto.effects.names import SCALAR_JOINTS
 from sb3_rpto.effects.simulation import Active, Switch, collect, filter_commands, names_of, prepare, pushing, settled
 from sb3_rpto.effects.world import BatchWorld, LiveWorld
+from sb3_rpto.sysid.data.coordinates import straight, velocity_addresses
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
 from sb3_rpto.sysid.data.signal_quality import MIN_ROWS
-from sb3_rpto.sysid.shooting.initial_states import straight, velocity_addresses
 from sb3_rpto.sysid.shooting.windows import command_order
 
 #: Cut-off of the zero-phase low pass in Hz; lower where the sampling asks for it.

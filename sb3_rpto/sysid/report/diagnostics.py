@@ -13,15 +13,13 @@ from sb3_rpto.effects.actuation import servo_of
 from sb3_rpto.effects.units import joint_of
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.signal_quality import Finding, listed
-from sb3_rpto.sysid.hypotheses.column_errors import CLEARLY
-from sb3_rpto.sysid.problem.prepare import SHORTER, SetUp
-from sb3_rpto.sysid.problem.unsupported_elements import Hint
+from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.report import descriptions
 from sb3_rpto.sysid.selection.adequacy import BEYOND, TOLERANCE, Adequacy
 from sb3_rpto.sysid.selection.stepwise_selection import Selector
 from sb3_rpto.sysid.shooting.multiple_shooting import START_STEPS, Problem
 from sb3_rpto.sysid.shooting.prediction_errors import HorizonError, horizon_errors, noise_floor, observed, predictions
-from sb3_rpto.sysid.shooting.windows import cut, noise_levels
+from sb3_rpto.sysid.shooting.windows import cut
 
 JOINT, SLIDE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtJoint.mjJNT_SLIDE)
 #: Test runs that err by so many times their noise are told; over all of them together none of the benchmark's 187
@@ -40,8 +38,6 @@ WORSE = 0.05
 STEPPED = 40
 #: A delay of less than this share of the time between two samples is told: clocks and integrators have such, too.
 BRIEF = 0.05
-#: Kinds of dry friction at a joint, a level of it that makes MuJoCo's own constraint act, and iterations of the fit.
-DRY, LITTLE, SOFT_FIT = ("coulomb_friction", "stribeck_friction", "position_friction"), 1e-9, 8
 
 
 def missed(
@@ -126,13 +122,15 @@ def vague_noise(after: Adequacy, data: Measurements) -> list[Finding]:
     return [Finding("vague noise", "fitted runs", message)]
 
 
-def strays(selector: Selector, values: np.ndarray, set_up: SetUp, after: Adequacy, seed: int) -> list[Finding]:
+def strays(
+    selector: Selector, values: np.ndarray, task: IdentificationProblem, after: Adequacy, seed: int
+) -> list[Finding]:
     """Windows that the final model misses by far, run by run: one that stalled or was touched leaves them.
 
     :param values: of that model, (p,)
     :param after: its adequacy
     """
-    parts = [(selector.train, set_up.fitted)] + ([(selector.select, set_up.select)] if selector.select else [])
+    parts = [(selector.train, task.fitted)] + ([(selector.select, task.select)] if selector.select else [])
     fits = [problem.score(values) for problem, _ in parts]
     errors = np.concatenate([fit.errors for fit in fits])
     noise = np.concatenate([problem.noise_errors(fit, seed).ravel() for (problem, _), fit in zip(parts, fits)])
@@ -202,48 +200,6 @@ def at_bounds(problem: Problem, values: np.ndarray, named: Sequence[int]) -> lis
     return found
 
 
-def creeping(problem: Problem, values: np.ndarray, named: Sequence[int]) -> tuple[list[Effect], float]:
-    """Dry friction, named or known, and the share of the error that is left where it is as MuJoCo's own.
-
-    That creeps where nothing else is said. So does that of a robot that somebody simulates by ``frictionloss`` alone,
-    and of no machine.
-
-    :param values: of the model that leaves something, (p,)
-    :param named: indices of its effects that were not known
-    :return: those that may creep, at joints without friction in the model; the share is 1 where there are none
-    """
-    simulation = problem.simulation
-    there = [e for i, e in enumerate(simulation.effects) if i in named or e.known]
-    dry = [e for e in there if e.kind in DRY or (isinstance(e, Declared) and e.firm)]
-    firm = [e for e in dry if simulation.model.dof_frictionloss[e.dof] == 0]
-    if not firm:
-        return [], 1.0
-    places = [s for e, s in zip(simulation.effects, simulation.slices) if e in there]
-    free = np.concatenate([np.arange(s.start, s.stop) for s in places])
-    model = simulation.model.__copy__()
-    # A joint that has some keeps its own constraint, see World.rough.
-    model.dof_frictionloss[[e.dof for e in firm]] = LITTLE
-    soft = Simulation(model, simulation.effects, simulation.nthread)
-    fit = Problem(soft, problem.windows, problem.scales).fit(values, free, iterations=SOFT_FIT)
-    return firm, float(np.median(fit.errors) / np.median(problem.score(values).errors))
-
-
-def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> list[Finding]:
-    """Whether dry friction that gives way at rest would leave less, see :func:`creeping`."""
-    firm, share = creeping(problem, values, named)
-    if share > 1 - WORSE:
-        return []
-    message = (
-        f"dry friction that gives way over {1e3 * problem.simulation.model.dof_solref[firm[0].dof, 0]:g} ms, as "
-        f"MuJoCo's does by default, leaves {share:.0%} of the error. Is this robot simulated? Set "
-        'solreffriction="0.001 1" there, and solimpfriction="0.99 0.99", as that of machines holds; or name '
-        "soft_friction among the candidates, or among the known effects"
-    )
-    model = problem.simulation.model
-    bodies = frozenset(int(model.dof_bodyid[e.dof]) for e in firm)
-    return [Hint("soft friction", ", ".join(e.label for e in firm), message, bodies=bodies, left=share)]
-
-
 def own_steps(
     nominal: mujoco.MjModel,
     simulation: Simulation,
@@ -276,36 +232,6 @@ def own_steps(
         'after are of finer ones: integrator="RK4" or a shorter timestep in the MJCF\'s <option> keeps them'
     )
     return [Finding("own steps", "corrected simulator", message)]
-
-
-def finer_steps(
-    problem: Problem, values: np.ndarray, free: np.ndarray, data: Measurements, horizon: float
-) -> list[Finding]:
-    """Whether transitions that pass for the model's own steps in time were made by finer ones.
-
-    :param problem: that the model was fitted to
-    :param values: of the fitted model, (p,)
-    :param free: indices of those that were fitted
-    :param data: that it was fitted to
-    :param horizon: length of its windows in s
-    """
-    if not data.exact:
-        return []
-    own = problem.simulation
-    model = own.model.__copy__()
-    model.opt.timestep /= SHORTER
-    finer = Simulation(model, own.effects, own.nthread)
-    windows = cut(model, data, noise_levels(data), horizon, STEPPED)
-    fit = Problem(finer, windows, problem.scales).fit(values, free, iterations=SOFT_FIT)
-    finer_error, error = float(np.median(fit.errors)), float(np.median(problem.score(values).errors))
-    if finer_error >= CLEARLY * error:
-        return []
-    message = (
-        f"with steps of {1e3 * model.opt.timestep:.3g} ms in place of {1e3 * own.model.opt.timestep:.3g} ms the model "
-        f"errs by {finer_error / error:.0%} of what it does: the target moves more finely than the model does, as a "
-        "machine or another simulator; shorten the timestep in the MJCF's <option>, and raise frame_skip in proportion"
-    )
-    return [Finding("time step", "the model", message)]
 
 
 def no_nearer(before: Sequence[HorizonError], after: Sequence[HorizonError]) -> list[Finding]:

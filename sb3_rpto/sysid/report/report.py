@@ -14,9 +14,10 @@ from sb3_rpto.effects import Declared, Effect, Simulation
 from sb3_rpto.effects.corrected_model_io import carried_by, check_free, corrected_files, write_files
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.files import json_text, plain
+from sb3_rpto.sysid.data.encoder_offsets import EncoderOffsets
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.signal_quality import Finding
-from sb3_rpto.sysid.hypotheses.encoder_offsets import Zeros, zeros_of
+from sb3_rpto.sysid.hypotheses.encoder_offsets import offsets_of
 from sb3_rpto.sysid.problem.inverse_dynamics import ForceResidual
 from sb3_rpto.sysid.report import descriptions
 from sb3_rpto.sysid.selection.adequacy import Adequacy
@@ -166,7 +167,7 @@ class Report:
     residuals_before: list[ForceResidual]
     residuals_after: list[ForceResidual]
     findings: list[Finding]
-    zeros: Zeros | None
+    zeros: EncoderOffsets | None
     noise: dict[str, float]
     runs: dict[str, list[str]]
     judged_apart: bool
@@ -221,7 +222,7 @@ class Report:
 
         return apply_effects(env, self.correction)
 
-    def zeros_of(self, data: Measurements) -> Zeros:
+    def zeros_of(self, data: Measurements) -> EncoderOffsets:
         """The zeros of other runs' encoders by the corrected model: ``report.zeros_of(new).taken_off(new)`` is homed.
 
         :param data: recordings of the machine, columns in the order of those traced
@@ -231,7 +232,7 @@ class Report:
             raise ValueError("no encoder's zero was found to differ by run; predict the runs as they are")
         # A joint that was at rest in the recordings says as little here.
         data = replace(data, unobserved=tuple(dict.fromkeys((*data.unobserved, *self.data.unobserved))))
-        return zeros_of(self.simulation, self.values_after, data, self.sigma, self.horizon, self.zeros.joints)
+        return offsets_of(self.simulation, self.values_after, data, self.sigma, self.horizon, self.zeros.joints)
 
     def __str__(self) -> str:
         means, _ = descriptions.verdict(self.verdict, searched=bool(self.candidates))

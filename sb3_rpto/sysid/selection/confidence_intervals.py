@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.stats import t as student
 
 from sb3_rpto.dynamics.identifiable import entangled, null_directions, to_hold
 from sb3_rpto.fitting.loss import Loss
+from sb3_rpto.sysid.problem.problem import IdentificationProblem
+from sb3_rpto.sysid.selection.search import SearchResult
 from sb3_rpto.sysid.selection.stepwise_selection import Selection, Selector
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Linear, Problem
 from sb3_rpto.sysid.shooting.trimmed_refinement import NOTHING
@@ -17,7 +21,44 @@ LEAST = 1.5
 FINAL = 40
 
 
-def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+@dataclass(frozen=True)
+class FinalFit:
+    """The models that are reported, fitted to all windows.
+
+    :param problem: all windows
+    :param declared: parameters of the declared model, (p,)
+    :param values: of the corrected model, (p,)
+    :param intervals: bounds of their 95 % intervals, (2, p), see :func:`fit_with_intervals`
+    :param correlation: of the parameters, (p, p)
+    :param named: indices of the effects that the declared model lacked
+    :param free: indices of the parameters that were fitted
+    :param horizon: length of the windows in s
+    """
+
+    problem: Problem
+    declared: np.ndarray
+    values: np.ndarray
+    intervals: np.ndarray
+    correlation: np.ndarray
+    named: tuple[int, ...]
+    free: np.ndarray
+    horizon: float
+
+
+def refit(problem: IdentificationProblem, result: SearchResult) -> FinalFit:
+    """Fit the declared and the corrected model to all windows, train and select together."""
+    problem.inputs.say(0.85, "fitting the final model")
+    selector, named = result.on.fine, result.selection.model.effects
+    windows = selector.all_windows()
+    values, intervals, correlation = fit_with_intervals(result.selection, windows)
+    # Both models are fitted to all these data before they are compared on the test runs, the declared one as recorded.
+    recorded = windows if result.as_recorded is None else result.first.on.fine.all_windows()
+    declared = recorded.fit(result.first.base.fit.values, selector.free(()), iterations=FINAL, crude=0.0).values
+    free = selector.free(named)
+    return FinalFit(windows, declared, values, intervals, correlation, named, free, selector.horizon)
+
+
+def fit_with_intervals(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit on train and select together.
 
     Of what was given and only shows together, the last one stays what it was.
@@ -27,7 +68,7 @@ def refit(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarra
         (p, p), by the curvature: blocks are too few to tell them
     """
     joined = problem.windows
-    free = Selector(problem, problem, 0.0, lambda share, what: None).free(selection.model.effects)
+    free = Selector(problem, problem).free(selection.model.effects)
     fit = problem.fit(selection.model.fit.values, free, iterations=FINAL, crude=0.0)
     alike, held = not_told_apart(problem, fit, free)
     if len(held):

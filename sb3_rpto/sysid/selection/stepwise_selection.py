@@ -8,15 +8,13 @@ from dataclasses import dataclass, field, replace
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects import Scales, Simulation
-from sb3_rpto.fitting.loss import FAR
-from sb3_rpto.sysid.selection.cross_validation import unseen_errors
-from sb3_rpto.sysid.selection.model_comparison import GAIN, Evidence, compare, folds, several_missed
-from sb3_rpto.sysid.selection.multistart import Begin, beginnings
+from sb3_rpto.fitting.loss import FAR, Loss
+from sb3_rpto.sysid.problem.problem import Progress, silent
+from sb3_rpto.sysid.selection.model_comparison import GAIN, Evidence, compare, folds, several_missed, unseen_errors
 from sb3_rpto.sysid.shooting import trimmed_refinement
-from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
-from sb3_rpto.sysid.shooting.trimmed_refinement import led_on
-from sb3_rpto.sysid.shooting.windows import Windows, join
+from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Linear, Problem
+from sb3_rpto.sysid.shooting.trimmed_refinement import refine
+from sb3_rpto.sysid.shooting.windows import join
 
 #: t*, well above what complete sets need to have nothing named (`benchmark threshold`: at most 2.0 in 30, most 0), as
 #: real noise is not theirs; `calibrate` measures it for the data at hand.
@@ -43,7 +41,8 @@ ROUNDS, INSTEAD, QUICK, PROMISING = 3, 8, 10, 4
 #: Typical window error, in units of the noise, that leaves nothing to look forward to.
 ENOUGH = 1.1
 
-Say = Callable[[float, str], None]
+#: So many starts of an effect are fitted: those that promise most.
+STARTS_TRIED = 3
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,12 @@ class Selector:
     """
 
     def __init__(
-        self, train: Problem, select: Problem | None, threshold: float, say: Say, horizon: float = 0.0
+        self,
+        train: Problem,
+        select: Problem | None = None,
+        threshold: float = THRESHOLD,
+        say: Progress = silent,
+        horizon: float = 0.0,
     ) -> None:
         self.train, self.select, self.threshold, self.say = train, select, threshold, say
         self.horizon = horizon
@@ -99,31 +103,12 @@ class Selector:
         self.simulation = train.simulation
         self._memory: dict[tuple[int, ...], Model] = {}
 
-    @classmethod
-    def on(
-        cls,
-        simulation: Simulation,
-        windows: tuple[Windows, Windows | None],
-        scales: Sequence[Scales],
-        horizon: float,
-        progress: Callable[[float, str], None],
-    ) -> Selector:
-        """For the shipped threshold and windows to train and to select on."""
-        select = None if windows[1] is None else Problem(simulation, windows[1], scales)
-        return cls(
-            Problem(simulation, windows[0], scales),
-            select,
-            THRESHOLD,
-            lambda share, what: progress(0.2 + 0.5 * share, what),
-            horizon,
-        )
-
     @property
     def judging(self) -> Problem:
         """Where adequacy is judged: the select windows, or all where there are none."""
         return self.select or self.train
 
-    def every_window(self) -> Problem:
+    def all_windows(self) -> Problem:
         """All windows together, those to fit first."""
         if self.select is None:
             return self.train
@@ -139,7 +124,7 @@ class Selector:
             chosen[self.simulation.slices[i]] = True
         return np.flatnonzero(chosen | (self.train.known & self.simulation.strength))
 
-    def together(self, effects: Sequence[int], base: Fit, begin: Fit) -> tuple[Model, Model | None]:
+    def fit_together(self, effects: Sequence[int], base: Fit, begin: Fit) -> tuple[Model, Model | None]:
         """Fit all candidates at once; where that ends badly, again from the best few of their kinds.
 
         The cost has local minima where many effects begin at their nulls. From the best few it may end in a lower one,
@@ -156,9 +141,9 @@ class Selector:
             few = self._best_few(effects, base)
             other = self.train.fit(few.fit.values, free, base.starts, JOINT, tolerance=3e-3)
             best = min(best, other, key=lambda fit: fit.cost)
-        return self.model(effects, best), few
+        return self.fit_model(effects, best), few
 
-    def by_kind(self, effects: Sequence[int], apart: bool = False) -> dict[tuple[str, bool], list[int]]:
+    def group_by_kind(self, effects: Sequence[int], apart: bool = False) -> dict[tuple[str, bool], list[int]]:
         """Effects by their kind, those on driven joints ``apart`` or not: the drives of a machine are built alike."""
         model = self.simulation.model
         driven = set(model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0].tolist())
@@ -177,16 +162,16 @@ class Selector:
         some = np.arange(0, len(self.train.windows), 3)
         part, chosen = self.train.on(some), list[int]()
         fit = part.fit(base.values, self.free(()), base.starts[some], REFIT)
-        kinds = self.by_kind(effects)
+        kinds = self.group_by_kind(effects)
         for _ in range(min(ROUNDS, len(kinds))):
             self.say(0.0, f"another start, with {len(chosen)} of the candidates")
             fits = {k: part.fit(fit.values, self.free([*chosen, *g]), fit.starts, REFIT) for k, g in kinds.items()}
             best = min(fits, key=lambda k: fits[k].cost)
             chosen += kinds.pop(best)
             fit = fits[best]
-        return self.model(chosen, replace(fit, starts=base.starts), 2 * REFIT)
+        return self.fit_model(chosen, replace(fit, starts=base.starts), 2 * REFIT)
 
-    def model(self, effects: Sequence[int], begin: Fit, iterations: int = REFIT) -> Model:
+    def fit_model(self, effects: Sequence[int], begin: Fit, iterations: int = REFIT) -> Model:
         """Fit a model from the optimum of another, without the effects that it lacks.
 
         Where it ends worse than a smaller one is known to be, it begins again from that.
@@ -203,8 +188,8 @@ class Selector:
             fit = min(fit, again, key=lambda f: f.cost)
         return self._remembered(key, fit)
 
-    def anew(self, effects: Sequence[int], begin: Fit, iterations: int) -> Model:
-        """As :meth:`model`, but fitted from this beginning even where another fit is remembered; the better of both."""
+    def fit_model_from(self, effects: Sequence[int], begin: Fit, iterations: int) -> Model:
+        """As :meth:`fit_model`, but from this beginning even where another fit is remembered; the better of both."""
         key = tuple(sorted(effects))
         begun = self._less(begin.values, key)
         fit = self.train.fit(begun, self.free(key), begin.starts, iterations, tolerance=3e-3)
@@ -212,7 +197,7 @@ class Selector:
         return known if known is not None and known.fit.cost <= fit.cost else self._remembered(key, fit)
 
     def _unbent(self, model: Model, begin: Fit) -> Model:
-        """As :meth:`model`, but with shapes fitted from their nulls: what was there beside them may have bent them.
+        """As :meth:`fit_model`, but with shapes fitted from their nulls: what was there beside them may have bent them.
 
         A spring about another reference is one about its own and an offset, say.
         """
@@ -220,7 +205,7 @@ class Selector:
         if not shapes.any():
             return model
         values = np.where(shapes, self.simulation.null, begin.values)
-        return self.anew(model.effects, replace(begin, values=values, linear=None), REFIT)
+        return self.fit_model_from(model.effects, replace(begin, values=values, linear=None), REFIT)
 
     def _less(self, values: np.ndarray, key: Sequence[int]) -> np.ndarray:
         """Parameters at which all effects but the given and the known ones have no influence."""
@@ -230,11 +215,11 @@ class Selector:
                 less[s] = self.simulation.null[s]
         return less
 
-    def led_on(self, model: Model) -> Model:
+    def refine(self, model: Model) -> Model:
         """A model that errs more than need be, out of kinks that may hold its fit; exact data can be met exactly."""
-        if not (self.train.exact or self.train.touching or self.far(model)):
+        if not (self.train.exact or self.train.touching or self.model_error_dominates(model)):
             return model
-        return self._remembered(model.effects, led_on(self.train, model.fit, self.free(model.effects)))
+        return self._remembered(model.effects, refine(self.train, model.fit, self.free(model.effects)))
 
     def _remembered(self, effects: tuple[int, ...], fit: Fit) -> Model:
         fit = replace(fit, linear=self.train.linear(fit, self.free(effects)))
@@ -251,21 +236,21 @@ class Selector:
         """What ``with_`` gains over ``without`` on windows that neither was fitted to."""
         return compare(without.errors, with_.errors, self.blocks, rare=not self.train.exact)
 
-    def far(self, model: Model) -> bool:
+    def model_error_dominates(self, model: Model) -> bool:
         """Whether what a model lacks, and not the noise, makes its errors."""
         return bool(np.median(model.errors) > FAR)
 
-    def met(self, model: Model) -> bool:
+    def fits_exactly(self, model: Model) -> bool:
         """Whether a model meets exact data in every window, as only what is right does."""
         return self.train.exact and bool(model.fit.errors.max() < trimmed_refinement.ENOUGH)
 
-    def nearly_met(self, model: Model) -> bool:
+    def nearly_fits_exactly(self, model: Model) -> bool:
         """Whether exact data may be met by leading a model on."""
         return self.train.exact and bool(np.median(model.errors) < NEARLY)
 
     def limit(self, model: Model) -> tuple[float, float]:
         """The t and the gain that an effect of a model must exceed to stay."""
-        return (min(LIKELY, self.threshold), TENTH) if self.far(model) else (self.threshold, GAIN)
+        return (min(LIKELY, self.threshold), TENTH) if self.model_error_dominates(model) else (self.threshold, GAIN)
 
     def eliminate(self, outcome: Selection, limit: float | None = None) -> Selection:
         """Drop the effect whose removal costs least until all that remain have a t above the limit.
@@ -281,13 +266,13 @@ class Selector:
             order, costs = self.removal_costs(current)
             trifles = [e for e in order if costs[e] < TRIFLE * current.fit.cost]
             reduced = None
-            met = self.met(current)
+            met = self.fits_exactly(current)
             bundles = _bundles(order, trifles)
             if met:
-                bundles += [kind for kind in self.by_kind(order).values() if 1 < len(kind) < len(order)]
+                bundles += [kind for kind in self.group_by_kind(order).values() if 1 < len(kind) < len(order)]
             for drop in bundles:
-                trial = self.model([e for e in current.effects if e not in drop], current.fit)
-                if met and not self.met(trial):
+                trial = self.fit_model([e for e in current.effects if e not in drop], current.fit)
+                if met and not self.fits_exactly(trial):
                     trial = self._unbent(trial, current.fit)
                 evidence = self.evidence(current, trial)
                 self.say(1 - len(trial.effects) / begun, f"{len(current.effects)} effects left, trying without some")
@@ -324,7 +309,7 @@ class Selector:
             current = selection.model
             selection.evidence = {}
             for e in current.effects:
-                without = self.model([i for i in current.effects if i != e], current.fit, REFIT + 3)
+                without = self.fit_model([i for i in current.effects if i != e], current.fit, REFIT + 3)
                 selection.evidence[e] = self.evidence(current, without)
             weak = [e for e, evidence in selection.evidence.items() if not evidence.clear(*self.limit(current))]
             if not weak:
@@ -332,9 +317,9 @@ class Selector:
                 return selection
             worst = min(weak, key=lambda e: selection.evidence[e].t)
             selection.dropped[worst] = (0, selection.evidence[worst])
-            selection.model = self.model([i for i in current.effects if i != worst], current.fit)
+            selection.model = self.fit_model([i for i in current.effects if i != worst], current.fit)
 
-    def look_forward(
+    def add_effects(
         self,
         selection: Selection,
         candidates: Sequence[int],
@@ -356,7 +341,7 @@ class Selector:
             if np.median(current.errors) < ENOUGH and not several_missed(current.errors, self.blocks):
                 break
             tried: list[tuple[float, Model, int]] = []
-            for e, begin in self.promising(current, [c for c in candidates if c not in current.effects]):
+            for e, begin in self.most_promising(current, [c for c in candidates if c not in current.effects]):
                 trial = self._with(current, e, begin)
                 evidence = self.evidence(trial, current)
                 if evidence.clear(*self.limit(trial)):
@@ -383,15 +368,15 @@ class Selector:
 
     def _with(self, model: Model, effect: int, begin: Fit) -> Model:
         self.say(0.0, f"looking at {self.simulation.effects[effect].label}")
-        return self.model([*model.effects, effect], begin, JOINT)
+        return self.fit_model([*model.effects, effect], begin, JOINT)
 
-    def promise(self, model: Model, effects: Sequence[int]) -> float:
+    def predicted_gain(self, model: Model, effects: Sequence[int]) -> float:
         """Share of the error that a model would save with all of some effects, if the cost were quadratic."""
         free = self.free([*effects, *model.effects])
         saved = self.train.linear(model.fit, free).fall(np.arange(len(free))) / model.fit.cost
         return 1 - float(np.sqrt(max(0.0, 1 - saved)))
 
-    def promising(self, model: Model, outside: Sequence[int]) -> list[tuple[int, Fit]]:
+    def most_promising(self, model: Model, outside: Sequence[int]) -> list[tuple[int, Fit]]:
         """The effects outside that lower the log errors or the cost most in a short fit to every third window.
 
         :return: each with where a fit may begin: the model's, with the effect's own start that did best
@@ -422,14 +407,14 @@ class Selector:
         values[s] = start[s]
         return replace(model.fit, values=values, linear=None)
 
-    def in_place_of(self, model: Model, rest: Sequence[int], candidates: Sequence[int]) -> Model | None:
+    def replace_by_one(self, model: Model, rest: Sequence[int], candidates: Sequence[int]) -> Model | None:
         """A model of exact data with one effect in the place of all but the ``rest`` that meets them as well, if any.
 
         :param model: that meets them
         :param rest: effects of it that stay
         :param candidates: what may take the place of the others
         """
-        smaller = self.model(rest, model.fit)
+        smaller = self.fit_model(rest, model.fit)
         outside = [e for e in candidates if e not in model.effects]
         for e, begins in self._promised(self.train, smaller.fit, rest, outside).items():
             effects = sorted([*rest, e])
@@ -438,17 +423,17 @@ class Selector:
             self.say(1.0, f"{self.simulation.effects[e].label} in the place of several")
             fits = [self.train.fit(b.values, self.free(effects), smaller.fit.starts, JOINT) for b in begins]
             trial = self._remembered(tuple(effects), min(fits, key=lambda fit: fit.cost))
-            if self.nearly_met(trial) and not self.met(trial):
-                trial = self.led_on(trial)
-            if self.met(trial):
+            if self.nearly_fits_exactly(trial) and not self.fits_exactly(trial):
+                trial = self.refine(trial)
+            if self.fits_exactly(trial):
                 return trial
         return None
 
     def _promised(
         self, part: Problem, base: Fit, kept: Sequence[int], outside: Sequence[int]
-    ) -> dict[int, list[Begin]]:
+    ) -> dict[int, list[Start]]:
         """The effects outside that promise most to first order from any of their starts, with the best of those."""
-        begins = beginnings(part, base, self.free(kept), outside)
+        begins = rank_starts(part, base, self.free(kept), outside)
         best = sorted(outside, key=lambda e: -begins[e][0].fall)
         sure = sum(begins[e][0].fall == np.inf for e in outside)
         return {e: begins[e] for e in best[: QUICK + sure]}
@@ -459,3 +444,71 @@ def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:
     trifles = trifles[: (len(order) + 1) // 2]
     bundles = [trifles, trifles[: len(trifles) // 2], trifles[: len(trifles) // 4]] if len(trifles) > 1 else []
     return [b for b in bundles if len(b) > 1] + [[e] for e in order[:TRIED]]
+
+
+# --- where fits may start ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the fit of an effect may start.
+
+    :param values: all parameters, those of the effect at one of its starts, (p,)
+    :param fall: how far the cost would fall from there to first order, with the parameters that were free before;
+        infinite for what promises nothing to first order, such as a limit beyond reach
+    """
+
+    values: np.ndarray
+    fall: float
+
+
+def rank_starts(
+    problem: Problem, base: Fit, free: Sequence[int] | np.ndarray, effects: Sequence[int]
+) -> dict[int, list[Start]]:
+    """Where the fits of some effects may start: for each effect the few starts that promise most, the best one first.
+
+    What the other parameters and the windows' starts do is the same for all, as an effect does nothing yet.
+
+    :param problem: windows
+    :param base: fitted without the effects
+    :param free: parameters that were free there
+    :param effects: their numbers
+    """
+    free = np.asarray(free, dtype=int)
+    r, jt, jx = problem.linearise(base.values, base.starts, free)
+    loss, found = Loss.of(r), {}
+
+    def fall(values: np.ndarray, strengths: np.ndarray) -> float:
+        columns, step = [jt], problem.steps(values)
+        for k in strengths:
+            rows = np.tile(values, (len(r), 1))
+            rows[:, k] += step[k]
+            there = problem.residuals(rows, base.starts, np.arange(len(r)))
+            columns.append(((there - r) * (problem.size[k] / step[k]))[:, :, None])
+        reduced = problem.reduce(r, np.concatenate(columns, axis=2), jx, base.starts, loss)
+        linear = Linear(reduced.normal, reduced.gradient, np.concatenate([free, strengths]))
+        return problem.bounded_fall(linear, values)
+
+    for effect in effects:
+        s = problem.simulation.slices[effect]
+        strengths = np.arange(s.start, s.stop)[problem.simulation.strength[s]]
+        limit = any(p.starts and not p.shape for p in problem.simulation.effects[effect].parameters)
+        begins = []
+        for own in starts_of(problem, effect):
+            values = base.values.copy()
+            values[s] = own
+            begins.append(Start(values, np.inf if limit else fall(values, strengths)))
+        found[effect] = begins if limit else sorted(begins, key=lambda begin: -begin.fall)[:STARTS_TRIED]
+    return found
+
+
+def starts_of(problem: Problem, effect: int) -> list[np.ndarray]:
+    """The effect's own parameters where a fit of it may start: its nulls, and each other value of one of them."""
+    simulation, s = problem.simulation, problem.simulation.slices[effect]
+    found = [simulation.null[s]]
+    for i, parameter in enumerate(simulation.effects[effect].parameters):
+        for value in parameter.starts_for(problem.size[s.start + i]):
+            if value != parameter.null:
+                found.append(simulation.null[s].copy())
+                found[-1][i] = value
+    return found

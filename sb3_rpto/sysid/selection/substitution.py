@@ -25,7 +25,7 @@ SUBSTITUTES, LIKE, AKIN = 5, 0.3, 0.6
 RIGHT, ERRS = 0.01, 0.1
 
 
-class Likes:
+class Substitution:
     """Exchanges effects of a model for others that could stand for them.
 
     :param selector: fits and compares the models
@@ -60,7 +60,7 @@ class Likes:
                         alike.append(best)
                         current, best = trial, other
             selection.alike[best] = sorted({*alike} - {best})
-        selection.model = current = self.simplest(current, selection)
+        selection.model = current = self.prefer_simplest(current, selection)
         selection.alike = {
             e: [i for i in found if i not in current.effects]
             for e, found in selection.alike.items()
@@ -74,7 +74,7 @@ class Likes:
         Far from the noise it is not worth its time: neither the two nor the one are right. No mixture meets exact data.
         """
         current, selector = selection.model, self.selector
-        if selector.far(current) or selector.met(current):
+        if selector.model_error_dominates(current) or selector.fits_exactly(current):
             return selection
         pairs = sorted(combinations(current.effects, 2), key=lambda pair: -self.screening.cosine[pair])[:MERGES]
         for pair in pairs:
@@ -99,18 +99,18 @@ class Likes:
         """
         stands = [(e, one) for e in pair for one in selection.alike.get(e, []) if one not in model.effects]
         for e, one in sorted(stands, key=lambda stand: len(self.effects[stand[1]].parameters)):
-            yield one, self.selector.anew([*rest, one], self._exchanged(model, e, one).fit, EXCHANGED)
+            yield one, self.selector.fit_model_from([*rest, one], self._exchanged(model, e, one).fit, EXCHANGED)
         outside = [i for i in range(len(self.effects)) if i not in rest and self.screening.excited(i)]
         outside = [i for i in outside if not self.effects[i].known]
-        for one, begin in self.selector.promising(self.selector.model(rest, model.fit), outside):
-            yield one, self.selector.model([*rest, one], begin, EXCHANGED)
+        for one, begin in self.selector.most_promising(self.selector.fit_model(rest, model.fit), outside):
+            yield one, self.selector.fit_model([*rest, one], begin, EXCHANGED)
 
-    def uniform(self, model: Model, selection: Selection) -> Model:
+    def make_uniform(self, model: Model, selection: Selection) -> Model:
         """Try the kind that is kept most in the place of each odd one that it resembles: joints are built alike.
 
         An odd one may have been chosen while the others were still wrong.
         """
-        if self.selector.met(model):
+        if self.selector.fits_exactly(model):
             return model
         usual = Counter(self.kinds[e] for e in model.effects).most_common(1)
         for e in model.effects:
@@ -120,13 +120,13 @@ class Likes:
             if places < 2 or self.kinds[e] == kind or self.screening.cosine[e, other] < LIKE:
                 continue
             self.selector.say(1.0, f"{self.effects[other].label}, as elsewhere")
-            trial = self.selector.led_on(self._exchanged(model, e, other))
+            trial = self.selector.refine(self._exchanged(model, e, other))
             if self._better(trial, model):
                 model = trial
                 selection.alike[other] = sorted({*selection.alike.pop(e, [])} - {other})
         return model
 
-    def simplest(self, model: Model, selection: Selection) -> Model:
+    def prefer_simplest(self, model: Model, selection: Selection) -> Model:
         """Take the simpler ones of a class that do as well now that all else is right: richer ones win by trifles."""
         for e in model.effects:
             for other in sorted(self.screening.alike(e), key=lambda i: len(self.effects[i].parameters)):
@@ -134,28 +134,28 @@ class Likes:
                     continue
                 self.selector.say(1.0, f"{self.effects[other].label} is simpler")
                 trial = self._exchanged(model, e, other)
-                if self.selector.train.exact and not self.selector.far(model):
-                    trial = self.selector.led_on(trial)
+                if self.selector.train.exact and not self.selector.model_error_dominates(model):
+                    trial = self.selector.refine(trial)
                 if not self._better(model, trial):
                     model = trial
                     selection.alike[other] = sorted({*selection.alike.pop(e, []), e} - {other})
                     break
         return model
 
-    def instead(self, model: Model, old: int, new: int, problem: Problem, starts: np.ndarray) -> Fit:
+    def fit_instead(self, model: Model, old: int, new: int, problem: Problem, starts: np.ndarray) -> Fit:
         """Fit ``new`` in the place of ``old`` to other windows from their ``starts``, all else of the model with it."""
         values, simulation = self._translated(model, old, new).values, self.selector.simulation
         values[simulation.slices[old]] = simulation.null[simulation.slices[old]]
         free = self.selector.free([*(i for i in model.effects if i != old), new])
         return problem.fit(values, free, starts, EXCHANGED, tolerance=3e-3)
 
-    def in_all_places(self, selection: Selection) -> Selection:
+    def find_alike_everywhere(self, selection: Selection) -> Selection:
         """Name kinds that do as well in the place of all of a kind at once, though one of them alone would not.
 
         Late sensors of all joints answer to late commands of all of them, where only the commands move the joints.
         """
         model = selection.model
-        if self.selector.met(model):  # as only what is right does
+        if self.selector.fits_exactly(model):  # as only what is right does
             return selection
         counts = Counter(self.kinds[e] for e in model.effects)
         for usual in sorted(kind for kind, places in counts.items() if places > 1):
@@ -174,7 +174,7 @@ class Likes:
 
         They may be fewer then: sensors of many joints that look late answer to a few commands that are.
         """
-        if self.selector.met(model):  # nothing could be better
+        if self.selector.fits_exactly(model):  # nothing could be better
             return model
         for kind in sorted({*self.kinds} - {"declared"}):
             swaps = self._swaps(model, kind, LIKE if kind in {self.kinds[e] for e in model.effects} else AKIN)
@@ -182,8 +182,8 @@ class Likes:
                 continue
             self.selector.say(1.0, f"{kind} in all places")
             trial = self._swapped(model, swaps)
-            if self.selector.nearly_met(trial):  # where all places change at once, kinks hold the fit
-                trial = self.selector.led_on(trial)
+            if self.selector.nearly_fits_exactly(trial):  # where all places change at once, kinks hold the fit
+                trial = self.selector.refine(trial)
             if self.selector.evidence(trial, model).clear(SEEMS):
                 model = trial
         return model
@@ -201,7 +201,7 @@ class Likes:
         slices, begin = self.selector.simulation.slices, replace(model.fit, values=model.fit.values.copy(), linear=None)
         for old, new in swaps.items():
             begin.values[slices[new]] = self._translated(model, old, new).values[slices[new]]
-        return self.selector.model(sorted({swaps.get(e, e) for e in model.effects}), begin, 2 * REFIT)
+        return self.selector.fit_model(sorted({swaps.get(e, e) for e in model.effects}), begin, 2 * REFIT)
 
     def _excited(self, kind: str) -> list[int]:
         """The places of a kind that the data could show."""
@@ -221,11 +221,11 @@ class Likes:
         the likest to first order is far from what is.
         """
         effects = [*(i for i in model.effects if i != old), new]
-        found = self.selector.model(effects, self._translated(model, old, new), EXCHANGED)
+        found = self.selector.fit_model(effects, self._translated(model, old, new), EXCHANGED)
         if self._twins(old, new) and found.fit.cost > model.fit.cost:
             slices, values = self.selector.simulation.slices, model.fit.values.copy()
             values[slices[new]] = values[slices[old]]
-            return self.selector.anew(effects, replace(model.fit, values=values, linear=None), EXCHANGED)
+            return self.selector.fit_model_from(effects, replace(model.fit, values=values, linear=None), EXCHANGED)
         return found
 
     def _twins(self, a: int, b: int) -> bool:
@@ -255,13 +255,13 @@ class Likes:
         return replace(model.fit, values=np.clip(values, train.lower, train.upper), linear=None)
 
     def _better(self, a: Model, b: Model) -> bool:
-        """Whether one of two likes does better: near the noise that seems so soon, far from it it must be clear.
+        """Whether one of two substitution does better: near the noise that seems so soon, far from it it must be clear.
 
         Where the other meets exact data, one that is far nearer still is right, though no window denies the other.
         """
-        if self.selector.met(b) and ERRS < b.fit.errors.max() > a.fit.errors.max() / RIGHT:
+        if self.selector.fits_exactly(b) and ERRS < b.fit.errors.max() > a.fit.errors.max() / RIGHT:
             return True
-        far = self.selector.far(a)
+        far = self.selector.model_error_dominates(a)
         return self.selector.evidence(a, b).clear(*(self.selector.limit(a) if far else (SEEMS, GAIN)))
 
     def _simpler(self, a: int, b: int) -> bool:

@@ -11,7 +11,7 @@ from sb3_rpto.sysid.shooting.multiple_shooting import Fit
 LEVEL = 0.95
 
 
-def calibrated(selector: Selector, base: Fit, chosen: list[int], sets: int, seed: int) -> float:
+def calibrate_threshold(selector: Selector, base: Fit, chosen: list[int], sets: int, seed: int) -> float:
     """t*: the threshold that names no effect in 95 % of complete sets, at least that of a single test.
 
     Each set is simulated from the fitted declared model in the windows at hand, with the noise of the data; all chosen
@@ -23,18 +23,20 @@ def calibrated(selector: Selector, base: Fit, chosen: list[int], sets: int, seed
     :param sets: number of sets; 20 leave one above the threshold
     :param seed: of the noise
     """
-    return max(LIKELY, float(np.quantile([needed(selector, base, chosen, seed + i) for i in range(sets)], LEVEL)))
+    return max(
+        LIKELY, float(np.quantile([threshold_of_set(selector, base, chosen, seed + i) for i in range(sets)], LEVEL))
+    )
 
 
-def needed(selector: Selector, base: Fit, chosen: list[int], seed: int) -> float:
-    """The least threshold that names nothing on one complete set, see :func:`strongest`."""
+def threshold_of_set(selector: Selector, base: Fit, chosen: list[int], seed: int) -> float:
+    """The least threshold that names nothing on one complete set, see :func:`least_threshold`."""
     rng = np.random.default_rng(seed)
     train = selector.train.redrawn(base, rng)
     select = None if selector.select is None else selector.select.redrawn(selector.select.score(base.values), rng)
-    return strongest(Selector(train, select, selector.threshold, selector.say, selector.horizon), base, chosen)
+    return least_threshold(Selector(train, select, selector.threshold, selector.say, selector.horizon), base, chosen)
 
 
-def strongest(selector: Selector, base: Fit, chosen: list[int]) -> float:
+def least_threshold(selector: Selector, base: Fit, chosen: list[int]) -> float:
     """The least threshold with which the elimination, begun with all effects together, leaves none of them.
 
     Where it is stuck, the threshold rises to the least t of what it tried to drop.
@@ -43,12 +45,12 @@ def strongest(selector: Selector, base: Fit, chosen: list[int]) -> float:
     :param base: fit of the declared parameters
     :param chosen: indices of the candidates
     """
-    alone = selector.model((), base).fit
-    joint, _ = selector.together(chosen, alone, alone)
+    alone = selector.fit_model((), base).fit
+    joint, _ = selector.fit_together(chosen, alone, alone)
     outcome, level = selector.eliminate(Selection(joint), 0.0), 0.0
     while outcome.model.effects:
         current = outcome.model
         rests = [[i for i in current.effects if i != e] for e in selector.removal_costs(current)[0][:TRIED]]
-        level = min(selector.evidence(current, selector.model(rest, current.fit)).t for rest in rests)
+        level = min(selector.evidence(current, selector.fit_model(rest, current.fit)).t for rest in rests)
         outcome = selector.eliminate(outcome, level)
     return level

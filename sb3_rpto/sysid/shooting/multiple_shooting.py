@@ -10,8 +10,8 @@ import numpy as np
 from sb3_rpto.dynamics.box import bounded_step, stepped
 from sb3_rpto.effects import Declared, Scales, Simulation
 from sb3_rpto.fitting.loss import Loss
-from sb3_rpto.sysid.shooting.initial_states import moved, straight
-from sb3_rpto.sysid.shooting.interpolation import between, interpolate
+from sb3_rpto.sysid.data.coordinates import straight
+from sb3_rpto.sysid.shooting.initial_states import moved
 from sb3_rpto.sysid.shooting.windows import Windows
 
 #: Where a simulation became unstable, its residual in units of the noise.
@@ -139,7 +139,7 @@ class Problem:
                 out[:, :, [column]] = interpolate(q, v, at[column], dt, w.columns[[column]], dofs[[column]])
         for effect, x in sensing:
             for column in np.flatnonzero(w.columns == effect.adr):
-                speed = between(v[:, :, effect.dof], at[column])
+                speed = interpolate_linearly(v[:, :, effect.dof], at[column])
                 out[:, :, column] = effect.observe(out[:, :, column], speed, x[:, None])[0]
         return out
 
@@ -465,3 +465,42 @@ class _Step:
     residuals: np.ndarray  # (W, R)
     cost: float
     damping: float
+
+
+# --- between steps ----------------------------------------------------------------------------------------------------
+
+
+def interpolate(
+    q: np.ndarray, v: np.ndarray, at: np.ndarray, dt: float, columns: np.ndarray, dofs: np.ndarray
+) -> np.ndarray:
+    """Positions at fractional steps by cubic Hermite interpolation, before the start in a straight line, (n, S, m).
+
+    :param q: (n, K + 1, nq)
+    :param v: (n, K + 1, nv)
+    :param at: (n, S)
+    :param dt: length of a step in s
+    :param columns: addresses in q, (m,)
+    :param dofs: addresses in v, -1 for a coordinate that is interpolated linearly, (m,)
+    """
+    past, at = np.minimum(at, 0.0), np.maximum(at, 0.0)
+    if past.any():
+        straight = np.where(dofs >= 0, dt * v[:, 0][:, dofs], 0.0)[:, None]
+        return interpolate(q, v, at, dt, columns, dofs) + past[:, :, None] * straight
+    k = np.minimum(at.astype(int), q.shape[1] - 2)
+    s = (at - k)[:, :, None]
+    rows = np.arange(len(q))[:, None]
+    q0, q1 = q[rows, k][:, :, columns], q[rows, k + 1][:, :, columns]
+    if not np.any(s % 1):
+        return np.where(s == 0, q0, q1)
+    slope = q1 - q0
+    d0 = np.where(dofs >= 0, dt * v[rows, k][:, :, dofs], slope)
+    d1 = np.where(dofs >= 0, dt * v[rows, k + 1][:, :, dofs], slope)
+    return q0 + s * (d0 + s * ((3 * slope - 2 * d0 - d1) + s * (d0 + d1 - 2 * slope)))
+
+
+def interpolate_linearly(values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values (n, K + 1) at fractional steps (n, S), linearly; before the start those of it."""
+    at = np.maximum(at, 0.0)
+    k = np.minimum(at.astype(int), values.shape[1] - 2)
+    rows, part = np.arange(len(values))[:, None], at - k
+    return np.asarray((1 - part) * values[rows, k] + part * values[rows, k + 1])

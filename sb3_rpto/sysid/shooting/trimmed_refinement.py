@@ -26,7 +26,7 @@ FAR_AND_NEAR = (-2.0, 0.0)
 NOTHING = 1e-12
 
 
-def led_on(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
+def refine(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     """Lengthen and concentrate a fit; where it may still err, begin anew beside the best.
 
     The last is basin hopping (Wales and Doye 1997): for exact data until they are met, and where contacts come and go
@@ -38,20 +38,20 @@ def led_on(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     :param free: indices of the parameters that may move, (f,)
     :return: never of a higher cost than ``fit``
     """
-    fit, failed, rng = concentrated(problem, lengthened(problem, fit, free), free), 0, np.random.default_rng(0)
+    fit, failed, rng = fit_trimmed(problem, fit_lengthening(problem, fit, free), free), 0, np.random.default_rng(0)
     near = problem.touching and np.median(fit.errors) < NEAR
     hops = HOPS if len(free) and (problem.exact or near) else 0
     while failed < hops and fit.errors.max() > ENOUGH:
         hop = 10 ** rng.uniform(*FAR_AND_NEAR) * rng.standard_normal(len(free))
         beside = fit.values.copy()
         beside[free] = np.clip(beside[free] + hop * problem.size[free], problem.lower[free], problem.upper[free])
-        trial = concentrated(problem, problem.fit(beside, free, iterations=2 * ITERATIONS), free)
+        trial = fit_trimmed(problem, problem.fit(beside, free, iterations=2 * ITERATIONS), free)
         failed = 0 if trial.cost < WORTH * fit.cost else failed + 1
         fit = min(fit, trial, key=lambda f: f.cost)
     return fit
 
 
-def lengthened(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
+def fit_lengthening(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     """Fit the first samples of exact windows, then twice as many, and so on up to whole ones.
 
     Over a few samples a motion is nearly linear in the parameters, over long windows it may be chaotic: progressive
@@ -71,7 +71,7 @@ def lengthened(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     return min(fit, problem.fit(values, free, fit.starts, ITERATIONS), key=lambda f: f.cost)
 
 
-def concentrated(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
+def fit_trimmed(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     """Fit the windows that a fit predicts best, then all of them again, and so on while that pays.
 
     A window in which a contact opens or a joint comes to rest has a kinked error, and many of them hold a descent

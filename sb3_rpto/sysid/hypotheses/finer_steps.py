@@ -1,0 +1,44 @@
+"""Transitions that pass for the model's own steps in time were made by finer ones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_rpto.effects import Simulation
+from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.hypotheses.column_errors import CLEARLY
+from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
+from sb3_rpto.sysid.problem.problem import SHORTER, IdentificationProblem
+from sb3_rpto.sysid.selection.confidence_intervals import FinalFit
+from sb3_rpto.sysid.selection.search import SearchResult
+from sb3_rpto.sysid.shooting.multiple_shooting import Problem
+from sb3_rpto.sysid.shooting.windows import cut, noise_levels
+
+#: Most windows that steps in time are compared in, and iterations of the fit.
+WINDOWS, ITERATIONS = 40, 8
+
+
+class FinerSteps(Hypothesis):
+    """Exact states come from a simulator that moves more finely than the model does."""
+
+    def hints(self, problem: IdentificationProblem, result: SearchResult, fit: FinalFit) -> list[Finding]:
+        """Whether the model errs far less with shorter steps in time."""
+        data, own = problem.fitted, fit.problem.simulation
+        if not data.exact:
+            return []
+        model = own.model.__copy__()
+        model.opt.timestep /= SHORTER
+        finer = Simulation(model, own.effects, own.nthread)
+        windows = cut(model, data, noise_levels(data), fit.horizon, WINDOWS)
+        with_finer = Problem(finer, windows, fit.problem.scales).fit(fit.values, fit.free, iterations=ITERATIONS)
+        fits = with_finer, fit.problem.score(fit.values)
+        finer_error, error = (float(np.median(found.errors)) for found in fits)
+        if finer_error >= CLEARLY * error:
+            return []
+        message = (
+            f"with steps of {1e3 * model.opt.timestep:.3g} ms in place of {1e3 * own.model.opt.timestep:.3g} ms the "
+            f"model errs by {finer_error / error:.0%} of what it does: the target moves more finely than the model "
+            "does, as a machine or another simulator; shorten the timestep in the MJCF's <option>, and raise "
+            "frame_skip in proportion"
+        )
+        return [Finding("time step", "the model", message)]

@@ -1,0 +1,95 @@
+"""Recordings that turn out to come from a simulator's own steps in time."""
+
+from __future__ import annotations
+
+from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis, kept_effects
+from sb3_rpto.sysid.problem.data_origin import may_be_exact, met_exactly, origin
+from sb3_rpto.sysid.problem.problem import IdentificationProblem
+from sb3_rpto.sysid.selection.search import SearchResult
+
+#: What was assumed of friction and of kinds is asked anew where the recordings are of another origin.
+ANEW = {"kinds": None, "soft_friction": False}
+
+
+class SimulatorSubsteps(Hypothesis):
+    """They are of the model's integrator in steps that are a whole part of the model's."""
+
+    def applies(self, problem: IdentificationProblem, result: SearchResult) -> bool:
+        """Where the search met them better in such steps."""
+        return result.substeps is not None
+
+    def alternative(self, problem: IdentificationProblem, result: SearchResult) -> IdentificationProblem:
+        """The recordings read in those steps."""
+        return problem.assuming(simulated=True, substeps=result.substeps, **ANEW)
+
+    def accepts(self, result: SearchResult, alternative: SearchResult) -> bool:
+        """Where they explain, or nothing does."""
+        return alternative.explains or not result.explains
+
+    def finding(self, alternative: IdentificationProblem, result: SearchResult) -> Finding:
+        """Which steps."""
+        step = 1e3 * alternative.nominal.opt.timestep / alternative.data.substeps
+        message = (
+            f"from the model's integrator in steps of {step:g} ms, as a simulator's are: it meets them better than the "
+            "continuous motion does"
+        )
+        return Finding("simulated", "fitted runs", message)
+
+
+class SimulatorSteps(Hypothesis):
+    """They are of the model's own steps in time.
+
+    What is missing errs as much in one kind of steps as in another; with it in the model they can be told apart.
+    """
+
+    def applies(self, problem: IdentificationProblem, result: SearchResult) -> bool:
+        """Where something was found that does not explain, and with it the model's own steps meet them better."""
+        if result.explains or not result.selection.model.effects:
+            return False
+        asked, known = problem.inputs, kept_effects(result)
+        parameters = (asked.declared, problem.sigma, problem.length, asked.threads, known)
+        return origin(problem.nominal, problem.fitted, *parameters) != "machine"
+
+    def alternative(self, problem: IdentificationProblem, result: SearchResult) -> IdentificationProblem:
+        """The recordings read in the model's own steps."""
+        return problem.assuming(simulated=True, **ANEW)
+
+    def accepts(self, result: SearchResult, alternative: SearchResult) -> bool:
+        """In any case."""
+        return True
+
+    def finding(self, alternative: IdentificationProblem, result: SearchResult) -> Finding:
+        """When that showed."""
+        message = "from the model's own steps in time, as shows with what was found first; searched again in such steps"
+        return Finding("simulated", "fitted runs", message)
+
+
+class ExactStates(Hypothesis):
+    """They are a simulator's states without noise, which slow samples under commands that jump let pass for noisy."""
+
+    def applies(self, problem: IdentificationProblem, result: SearchResult) -> bool:
+        """Where noise cannot be told from motion, and nothing explains them or what does meets them exactly.
+
+        Wrong numbers may explain recordings without noise that were taken for noisy ones.
+        """
+        if not may_be_exact(problem.inputs.data):
+            return False
+        if not result.explains:
+            return True
+        asked = problem.inputs
+        parameters = (asked.declared, problem.length, asked.threads, kept_effects(result))
+        return met_exactly(problem.nominal, problem.fitted, *parameters)
+
+    def alternative(self, problem: IdentificationProblem, result: SearchResult) -> IdentificationProblem:
+        """The recordings read as exact states."""
+        return problem.assuming(exact=True, **ANEW)
+
+    def accepts(self, result: SearchResult, alternative: SearchResult) -> bool:
+        """Where they are explained so."""
+        return alternative.explains
+
+    def finding(self, alternative: IdentificationProblem, result: SearchResult) -> Finding:
+        """When that showed."""
+        message = "from the model's own steps in time, without noise, as shows with what was found: searched again"
+        return Finding("simulated", "fitted runs", message)
