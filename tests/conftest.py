@@ -2,6 +2,7 @@ import os
 import pickle
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 from unittest import mock
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -20,6 +21,7 @@ from sb3_rpto.algorithms import warm_start
 from sb3_rpto.effects import declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Report, trace
+from sb3_rpto.sysid.settings import ProblemSettings, Settings
 
 th.set_num_threads(1)
 # Machines may be busy: no test is timed.
@@ -79,9 +81,13 @@ def small(cls, env=None, target=None, **kwargs):
 
 
 @contextmanager
-def coarsely(step: float = 0.005) -> Iterator[None]:
-    """Measured motion is integrated in steps of 2 ms at most; tests are served by longer ones, in s."""
-    with mock.patch("sb3_rpto.sysid.shooting.windows.LONGEST", step):
+def coarsely(step: float = 0.005, **others: Any) -> Iterator[None]:
+    """Measured motion is integrated in steps of 2 ms at most; tests are served by longer ones, in s.
+
+    :param others: settings of the problem that change, too
+    """
+    settings = Settings(problem=ProblemSettings(longest_step=step, **others))
+    with mock.patch.dict(trace.__kwdefaults__, settings=settings):
         yield
 
 

@@ -9,12 +9,12 @@ from types import ModuleType
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import coarsely
 from stable_baselines3 import SAC
 
 from sb3_rpto.algorithms.closed_loop import controller
 from sb3_rpto.effects.corrected_model_io import load_corrected
 from sb3_rpto.sysid import Measurements
-from sb3_rpto.sysid.shooting import windows
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SMALL = ["--episodes", "6", "--duration", "2.5"]
@@ -90,10 +90,9 @@ def test_trace_robot_draws_by_seed(trace_robot):
 @pytest.mark.slow
 def test_robot_log_to_policy_goes_from_a_log_to_a_policy(monkeypatch, tmp_path, capsys):
     example = load("robot_log_to_policy", monkeypatch)
-    monkeypatch.setattr(windows, "LONGEST", 0.005)
-    monkeypatch.setattr(importlib.import_module("sb3_rpto.sysid.problem.problem"), "FEW", 12)
     monkeypatch.setattr(sys, "argv", ["robot_log_to_policy.py", "--quick", "--out", str(tmp_path)])
-    example.main()
+    with coarsely(few_windows=12):
+        example.main()
     header = "time,qpos.slider,qpos.hinge,qpos.hinge2,qvel.slider,qvel.hinge,qvel.hinge2,ctrl.slide"
     assert {file.read_text().splitlines()[0] for file in (tmp_path / "log").iterdir()} == {header}
     assert len(list((tmp_path / "log").iterdir())) == 8

@@ -18,9 +18,10 @@ from sb3_rpto.files import write_json
 from sb3_rpto.sysid.problem.problem import Inputs, prepare
 from sb3_rpto.sysid.selection.screening import screen
 from sb3_rpto.sysid.selection.search import SelectorPair, correct_for_discretisation, fit_declared, joint_candidates
-from sb3_rpto.sysid.selection.stepwise_selection import THRESHOLD
-from sb3_rpto.sysid.selection.threshold_calibration import LEVEL, least_threshold
+from sb3_rpto.sysid.selection.threshold_calibration import least_threshold
+from sb3_rpto.sysid.settings import DEFAULTS
 
+LEVEL, THRESHOLD = DEFAULTS.selection.calibration_level, DEFAULTS.selection.threshold
 NAME = "python -m benchmarks tracing threshold"
 #: Seeds of the sets begin here: those of the tracing benchmark are others.
 FIRST = 700_000

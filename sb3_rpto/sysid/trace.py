@@ -17,6 +17,7 @@ from sb3_rpto.sysid.report.build_report import build_report, predict
 from sb3_rpto.sysid.report.report import Report
 from sb3_rpto.sysid.selection.confidence_intervals import refit
 from sb3_rpto.sysid.selection.search import search
+from sb3_rpto.sysid.settings import DEFAULTS, Settings
 
 
 def trace(
@@ -32,6 +33,7 @@ def trace(
     threads: int = 0,
     simulated: bool = False,
     progress: Progress | None = None,
+    settings: Settings = DEFAULTS,
 ) -> Report:
     """Find out which effect a model lacks to explain measured data.
 
@@ -56,13 +58,14 @@ def trace(
     :param simulated: whether the recordings are of the model's own simulator, in its own steps in time; False: that is
         found out where it matters, at the latest when something is left unexplained, which takes a second search
     :param progress: called with the share done and what is being done
+    :param settings: every threshold of the method
     :return: the verdict, the effects, errors before and after, and the corrected model
     :raises ValueError: data and model do not fit together, the data are too few, or an argument is out of range
     :raises TypeError: ``declared`` or ``candidates`` is a string, not a list of them; data that were not read
     """
     _check_arguments(data, seed, candidates, horizon, calibrate, threads)
     say = _never_back(progress)
-    inputs = Inputs(model, data, declared, known, seed, candidates, horizon, calibrate, threads, say)
+    inputs = Inputs(model, data, declared, known, seed, candidates, horizon, calibrate, threads, say, settings)
     problem = prepare(inputs, Assumptions(simulated=simulated))
     result = search(problem)
     problem, result = try_alternatives(problem, result)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import importlib
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -28,9 +27,9 @@ from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.sysid import Measurements
+from sb3_rpto.sysid import Measurements, trace
 from sb3_rpto.sysid.data.signal_quality import Finding
-from sb3_rpto.sysid.shooting import windows
+from sb3_rpto.sysid.settings import ProblemSettings, Settings
 
 TASK, DT = "InvertedPendulum-v5", 0.04
 RATE, EVERY = 0.01, 4  # s between samples, samples between decisions
@@ -328,8 +327,8 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
 def quick(patch: pytest.MonkeyPatch) -> None:
     """Few windows and long steps in time: a trace of some seconds."""
     patch.setattr(source_buffer, "FILL", 50)
-    patch.setattr(windows, "LONGEST", 0.005)
-    patch.setattr(importlib.import_module("sb3_rpto.sysid.problem.problem"), "FEW", 8)
+    settings = Settings(problem=ProblemSettings(longest_step=0.005, few_windows=8))
+    patch.setitem(trace.__kwdefaults__, "settings", settings)
 
 
 @cache

@@ -10,7 +10,8 @@ from scipy.stats import binom
 from simulated import problem, recorded
 
 from sb3_rpto.effects.friction import CoulombFriction
-from sb3_rpto.sysid.selection.adequacy import CHANCE, RARE, Adequacy, adequacy, counted_with
+from sb3_rpto.sysid.selection.adequacy import Adequacy, adequacy, counted_with
+from sb3_rpto.sysid.settings import DEFAULTS
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
 
 #: the value at which dry friction does nothing
@@ -81,7 +82,7 @@ def test_a_misfit_of_a_few_windows_is_seen_by_their_number_alone(episodes: int, 
     found = adequacy(p, with_errors(p, errors), seed)
     assert found.low < 1.06
     assert found.strays == pytest.approx(1 / every, abs=0.02)
-    assert found.chance < 0.1 * CHANCE
+    assert found.chance < 0.1 * DEFAULTS.adequacy.chance
     assert not found.adequate
     assert found.denied_by_strays
 
@@ -95,7 +96,8 @@ def test_chance_is_the_binomials() -> None:
     n = len(errors)
     found = adequacy(p, with_errors(p, errors), 0)
     assert found.strays == pytest.approx(4 / n)
-    fewer = sum(math.comb(n, k) * RARE**k * (1 - RARE) ** (n - k) for k in range(4))
+    rare = DEFAULTS.adequacy.stray_share
+    fewer = sum(math.comb(n, k) * rare**k * (1 - rare) ** (n - k) for k in range(4))
     assert found.chance == pytest.approx(1 - fewer, rel=1e-9)
     assert len(np.unique(p.windows.block[strays])) == 4
 

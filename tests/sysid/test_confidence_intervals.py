@@ -6,7 +6,7 @@ from simulated import problem, recorded
 
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.fitting.loss import Loss
-from sb3_rpto.sysid.selection.confidence_intervals import correlations, half_widths, refit
+from sb3_rpto.sysid.selection.confidence_intervals import correlations, fit_with_intervals, half_widths
 from sb3_rpto.sysid.selection.stepwise_selection import Selection, Selector
 from sb3_rpto.sysid.shooting.multiple_shooting import Linear
 
@@ -65,11 +65,11 @@ def test_correlations_are_exactly_symmetric_and_one_on_the_diagonal() -> None:
 
 def test_intervals_are_as_wide_as_the_curvature_of_the_loss_says(monkeypatch: pytest.MonkeyPatch) -> None:
     p = problem([CoulombFriction("hinge")], recorded([CoulombFriction("hinge", level=0.05)]))
-    s = Selector(p, p, 3.5, lambda share, what: None)
+    s = Selector(p, p)
     selection, widths = Selection(s.fit_model((0,), p.score(p.null))), []
     for curvature in (1.0, 0.5):
         monkeypatch.setattr(Loss, "curvature", lambda loss, r, by=curvature: by)
-        values, intervals, correlation = refit(selection, p)
+        values, intervals, correlation = fit_with_intervals(selection, p)
         assert correlation.tolist() == [[1.0]]
         assert values[0] == pytest.approx(0.05, rel=0.05)
         widths.append(np.diff(intervals[:, 0])[0])

@@ -12,7 +12,9 @@ from simulated import PENDULUM, briefly, compiled, recorded
 
 from sb3_rpto.effects.forces import Spring
 from sb3_rpto.sysid import Measurements, Report
+from sb3_rpto.sysid.hypotheses.encoder_offsets import offsets_of
 from sb3_rpto.sysid.report.html import render
+from sb3_rpto.sysid.settings import ProblemSettings, Settings
 
 #: of six runs, in rad
 ZEROS = np.array([0.03, -0.02, 0.0, -0.04, 0.05, -0.01])
@@ -121,12 +123,11 @@ def test_a_joint_that_was_at_rest_says_nothing_of_new_zeros(monkeypatch: pytest.
 
 
 @pytest.mark.slow
-def test_every_run_is_told_its_zero_and_one_without_a_window_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_rpto.sysid.hypotheses.encoder_offsets.TRAIN", 2)
-    monkeypatch.setattr("sb3_rpto.sysid.hypotheses.encoder_offsets.SELECT", 1)
+def test_every_run_is_told_its_zero_and_one_without_a_window_is_named() -> None:
     report, zeros = traced(0.0, 1.0), [0.07, -0.05, 0.02, 0.04]
     new = shifted(recorded([], compiled(), 4, 4.0, seed=9), zeros)
-    found = report.zeros_of(new)
+    fitted = (report.simulation, report.values_after, new, report.sigma, report.horizon, report.zeros.joints)
+    found = offsets_of(*fitted, Settings(problem=ProblemSettings(train_windows=2, select_windows=1)))
     assert found.runs == ("0", "1", "2", "3")
     np.testing.assert_allclose(found.offsets[:, 0], zeros, atol=5e-3)
     short = new.episodes[-1].part_of(slice(20), after_gap=False)

@@ -1,5 +1,7 @@
 """A few kinds of effects, each at all its places: what meets exact data needs no others."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from simulated import PENDULUM, WITH_WHEEL, compiled, problem, recorded
@@ -7,10 +9,9 @@ from simulated import PENDULUM, WITH_WHEEL, compiled, problem, recorded
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import Spring, TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, StribeckFriction, ViscousFriction
-from sb3_rpto.sysid.selection import group_selection, stepwise_selection
-from sb3_rpto.sysid.selection.group_selection import select_groups
+from sb3_rpto.sysid.selection import stepwise_selection
 from sb3_rpto.sysid.selection.screening import screen
-from sb3_rpto.sysid.selection.search import SelectorPair, select_effects
+from sb3_rpto.sysid.selection.search import SelectorPair, select_effects, select_groups
 from sb3_rpto.sysid.selection.stepwise_selection import Model, Selection, Selector
 
 #: rad that count as noise of exact data
@@ -32,7 +33,7 @@ STRIBECK, COULOMB, OFFSET, VISCOUS = range(4)
 def selector(planted: list[Effect], exact: bool = True, candidates: list[Effect] = CANDIDATES) -> Selector:
     data = recorded(planted, noise=0.0 if exact else 1e-3, exact=exact)
     train = problem(candidates, data, noise=EXACT if exact else 1e-3)
-    return Selector(train, None)
+    return Selector(train)
 
 
 def base(s: Selector) -> Model:
@@ -60,13 +61,13 @@ def test_the_simplest_kind_that_meets_exact_data_is_taken(planted: Effect, found
 
 
 @pytest.mark.slow
-def test_two_kinds_meet_what_neither_does_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_kinds_meet_what_neither_does_alone() -> None:
     s = selector([CoulombFriction("hinge", level=0.08), TorqueOffset("hinge", offset=0.1)])
     model = few(s)
     assert model is not None
     assert s.fits_exactly(model)
     assert model.effects == (COULOMB, OFFSET)
-    monkeypatch.setattr(group_selection, "MOST", 1)
+    s.settings = replace(s.settings, selection=replace(s.settings.selection, kinds_together=1))
     assert few(s) is None
 
 
@@ -110,7 +111,7 @@ def test_noisy_data_are_never_met() -> None:
 def test_driven_joints_are_a_kind_apart() -> None:
     model = compiled(WITH_WHEEL)
     effects = [CoulombFriction("axle"), CoulombFriction("hinge"), TorqueOffset("axle")]
-    s = Selector(problem(effects, recorded(model=model), model), None)
+    s = Selector(problem(effects, recorded(model=model), model))
     assert list(s.group_by_kind([0, 1, 2], apart=True).values()) == [[0], [1], [2]]
     assert list(s.group_by_kind([0, 1, 2]).values()) == [[0, 1], [2]]
 
@@ -128,12 +129,12 @@ def test_an_offset_that_a_bent_spring_cancels_is_dropped() -> None:
 
 def test_a_kind_goes_as_a_whole_where_none_of_its_places_can_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """So it is with the six bent springs and five offsets of a HalfCheetah; here it is made so."""
-    monkeypatch.setattr(stepwise_selection, "_bundles", lambda order, trifles: [])
+    monkeypatch.setattr(stepwise_selection, "_bundles", lambda order, trifles, alone: [])
     planted: list[Effect] = [Spring("hinge", stiffness=0.5), Spring("elbow", stiffness=0.5)]
     candidates: list[Effect] = [Spring("hinge"), Spring("elbow"), TorqueOffset("hinge"), TorqueOffset("elbow")]
     model = compiled(WITH_FOREARM)
     train = problem(candidates, recorded(planted, noise=0.0, exact=True, model=model), model, noise=EXACT)
-    s = Selector(train, None)
+    s = Selector(train)
     every = s.fit_model((0, 1, 2, 3), s.train.score(np.array([0.5, 0.4, 0.5, -0.3, -0.2, 0.15])))
     assert s.fits_exactly(every)
     springs = s.eliminate(Selection(every)).model

@@ -9,8 +9,7 @@ from sb3_rpto.effects.bodies import Payload
 from sb3_rpto.effects.commands import CommandSaturation
 from sb3_rpto.effects.effect import Parameter
 from sb3_rpto.effects.forces import Spring, TorqueOffset, TorqueRipple
-from sb3_rpto.sysid.selection.multistart import TRIED, rank_starts
-from sb3_rpto.sysid.selection.stepwise_selection import Selection, Selector
+from sb3_rpto.sysid.selection.stepwise_selection import Selection, Selector, rank_starts
 
 #: the pole hangs from a cart, which is driven: mass and place of what hangs on the pole show apart
 WITH_CART = """<mujoco><option timestep="0.005" integrator="RK4"/><worldbody><body name="cart">
@@ -26,8 +25,8 @@ def test_of_all_counts_the_cogging_motors_own_is_among_those_that_are_tried(turn
     data = recorded([TorqueRipple("hinge", cosine=0.05, sine=0.05, turns=turns)], episodes=3)
     on = problem([TorqueRipple("hinge"), *declare(model, ["hinge.damping"])], data, model)
     damping = np.array([3])
-    tried = rank_starts(on, on.fit(on.null, damping, iterations=3), damping, [0])[0]
-    assert len(tried) == TRIED
+    tried = rank_starts(on, on.fit(on.null, damping, iterations=3), damping, [0], 3)[0]
+    assert len(tried) == 3
     assert turns in [begin.values[2] for begin in tried]
     assert all((begin.values[:2] == 0).all() for begin in tried)
     assert [begin.fall for begin in tried] == sorted((begin.fall for begin in tried), reverse=True)
@@ -35,7 +34,7 @@ def test_of_all_counts_the_cogging_motors_own_is_among_those_that_are_tried(turn
 
 def test_few_starts_are_all_tried() -> None:
     on = problem([CommandSaturation("motor")], recorded(episodes=2))
-    tried = rank_starts(on, on.score(on.null), [], [0])[0]
+    tried = rank_starts(on, on.score(on.null), [], [0], 3)[0]
     assert all(begin.fall == np.inf for begin in tried)  # beyond reach it does nothing, and promises nothing
     starts = np.concatenate([begin.values for begin in tried])
     np.testing.assert_allclose(starts, np.array([0.0, 0.6, 1.5, 3.0]) * on.size[0])
@@ -58,7 +57,7 @@ def test_what_the_bounds_forbid_promises_nothing() -> None:
     model = compiled()
     data = recorded([TorqueOffset("hinge", offset=0.3)], episodes=3)
     on = problem([Spring("hinge")], data, model)
-    tried = rank_starts(on, on.score(on.null), [], [0])[0]
+    tried = rank_starts(on, on.score(on.null), [], [0], 3)[0]
     assert tried[0].values[1] > 0  # a torque to the positive side is a spring that rests far there
     assert tried[0].fall > 0
 
@@ -68,7 +67,7 @@ def test_a_payload_is_found_wherever_it_sits_along_the_link(along: float) -> Non
     model = compiled(WITH_CART)
     data = recorded([Payload("pole", mass=0.2, along=along)], model, episodes=4, start=[0.2, 0.5])
     on = problem([Payload("pole")], data, model)
-    selector = Selector(on, None, 3.5, lambda share, what: None)
+    selector = Selector(on)
     found = selector.add_effects(Selection(selector.fit_model((), on.score(on.null))), [0])
     np.testing.assert_allclose(found.model.fit.values, [0.2, along], rtol=0.05)
 
@@ -76,6 +75,6 @@ def test_a_payload_is_found_wherever_it_sits_along_the_link(along: float) -> Non
 def test_a_ripple_of_another_count_is_found() -> None:
     data = recorded([TorqueRipple("hinge", cosine=0.05, sine=0.05, turns=14.0)], episodes=6)
     on = problem([TorqueRipple("hinge")], data)
-    selector = Selector(on, None, 3.5, lambda share, what: None)
+    selector = Selector(on)
     found = selector.add_effects(Selection(selector.fit_model((), on.score(on.null))), [0])
     np.testing.assert_allclose(found.model.fit.values, [0.05, 0.05, 14.0], rtol=0.02)

@@ -6,7 +6,8 @@ import pytest
 
 from sb3_rpto.effects import Drive, Simulation
 from sb3_rpto.sysid import Measurements
-from sb3_rpto.sysid.problem.problem import SHORTER, with_room
+from sb3_rpto.sysid.problem.problem import with_room
+from sb3_rpto.sysid.settings import DEFAULTS
 from sb3_rpto.sysid.shooting.windows import discretised
 
 DELAYED = """<mujoco><option timestep="0.004"/><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size=".1"
@@ -26,7 +27,7 @@ def first_motion(model: mujoco.MjModel) -> float:
     return float(np.flatnonzero(np.abs(v[0, :, 0]) > 0)[0] * model.opt.timestep)
 
 
-@pytest.mark.parametrize("shorter", [1, SHORTER])
+@pytest.mark.parametrize("shorter", [1, DEFAULTS.problem.finer_steps])
 def test_a_delay_lasts_in_the_shorter_steps_of_measured_data(shorter: int) -> None:
     spec = mujoco.MjSpec.from_string(DELAYED)
     compiled = spec.compile()

@@ -13,7 +13,8 @@ from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, StribeckFriction, ViscousFriction
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.selection.screening import EXCITED, Screening, _orthogonal, screen
+from sb3_rpto.sysid.selection.screening import Screening, _orthogonal, screen
+from sb3_rpto.sysid.settings import DEFAULTS
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
 
 
@@ -129,7 +130,7 @@ def test_declared_damping_takes_viscous_friction_whole() -> None:
     assert held.sensitivity[0] < 0.02 * free.sensitivity[0]
     assert not held.excited(0)
     # Dry friction keeps what viscous friction cannot do.
-    assert EXCITED < held.sensitivity[1] < free.sensitivity[1]
+    assert DEFAULTS.screening.excited < held.sensitivity[1] < free.sensitivity[1]
     assert held.sensitivity[2] == 0
     assert held.taken == [2, None, None]
     assert free.taken == [None, None]

@@ -16,14 +16,16 @@ from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, PositionFriction, QuadraticDrag, StribeckFriction
 from sb3_rpto.fitting.loss import FAR
-from sb3_rpto.sysid.selection.model_comparison import GAIN, Evidence, compare, folds
+from sb3_rpto.sysid.selection.model_comparison import Evidence, compare, folds
 from sb3_rpto.sysid.selection.screening import screen
 from sb3_rpto.sysid.selection.search import SelectorPair, correct_for_discretisation, select_effects
-from sb3_rpto.sysid.selection.stepwise_selection import INSTEAD, LIKELY, ROUNDS, TENTH, Model, Selection, Selector
+from sb3_rpto.sysid.selection.stepwise_selection import Model, Selection, Selector
+from sb3_rpto.sysid.settings import DEFAULTS
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit
 from sb3_rpto.sysid.shooting.windows import cut
 
-THRESHOLD = 3.5
+THRESHOLD, GAIN = DEFAULTS.selection.threshold, DEFAULTS.comparison.least_gain
+ROUNDS, INSTEAD = DEFAULTS.selection.rounds, DEFAULTS.selection.rounds_instead
 COULOMB, OFFSET, DRAG = 0, 1, 2
 
 
@@ -38,7 +40,7 @@ def eliminated(s: Selector) -> Selection:
     count = range(len(s.simulation.effects))
     base = s.fit_model((), s.train.score(s.train.null))
     full, _ = s.fit_together(list(count), base.fit, base.fit)
-    return s.eliminate(Selection(full), s.threshold)
+    return s.eliminate(Selection(full), THRESHOLD)
 
 
 @cache
@@ -244,7 +246,7 @@ def test_near_the_noise_evidence_must_be_clearer_far_from_it_the_gain_larger() -
     assert s.limit(kept.model) == (THRESHOLD, GAIN)
     far = s.fit_model((), kept.model.fit)
     assert np.median(far.errors) > FAR
-    assert s.limit(far) == (LIKELY, TENTH)
+    assert s.limit(far) == (DEFAULTS.selection.threshold_far, DEFAULTS.selection.gain_far)
 
 
 @pytest.mark.parametrize(
@@ -330,9 +332,9 @@ def test_recordings_less_the_error_of_coarse_steps_are_met_by_them() -> None:
 
     def rough_or_fine(integrator: str) -> Selector:
         model = compiled(PENDULUM.replace("RK4", integrator))
-        return Selector(problem(effects, data, model, noise=1e-4), None)
+        return Selector(problem(effects, data, model, noise=1e-4))
 
-    on = SelectorPair(rough_or_fine("RK4"), rough_or_fine("Euler"), lambda share, what: None)
+    on = SelectorPair(rough_or_fine("RK4"), rough_or_fine("Euler"))
     null = on.fine.train.null
     after = correct_for_discretisation(on, null)
     assert after.fine is on.fine
@@ -361,7 +363,7 @@ def test_a_larger_model_begins_at_the_smaller_ones_optimum_and_is_never_worse() 
         assert large.fit.cost <= small.fit.cost * (1 + 1e-9)
         small = large
     # With no iteration to spend on it, it is the smaller one.
-    fresh = Selector(s.train, s.select, THRESHOLD, s.say)
+    fresh = Selector(s.train, s.select, s.say)
     begin = small.fit
     assert fresh.fit_model([COULOMB, OFFSET, DRAG], begin, iterations=1).fit.cost <= begin.cost * (1 + 1e-9)
 
@@ -394,7 +396,7 @@ def test_the_cost_of_a_removal_is_that_of_the_fit_without_it_where_the_effect_is
 def test_evidence_is_judged_on_the_select_windows_alone() -> None:
     s, selection = with_friction()
     base = s.fit_model((), s.train.score(s.train.null))
-    other = Selector(s.train, s.select, THRESHOLD, s.say)
+    other = Selector(s.train, s.select, s.say)
     worse = replace(selection.model, errors=2 * base.errors)
     assert other.evidence(worse, base).gain == pytest.approx(1 - 2)
 
@@ -433,7 +435,7 @@ def test_a_fold_is_judged_as_by_a_fit_to_the_others() -> None:
     """One Gauss-Newton step from the fit to all windows is nearly that fit."""
     effects: list[Effect] = [CoulombFriction("hinge"), TorqueOffset("hinge")]
     p = problem(effects, recorded([CoulombFriction("hinge", level=0.05)], episodes=3, noise=2e-3), noise=2e-3)
-    s = Selector(p, None, THRESHOLD, lambda share, what: None, 0.4)
+    s = Selector(p, horizon=0.4)
     full = s.fit_model((0, 1), p.score(p.null), 20)
     assert len(s.folds) == 6
     expected, inside = [], []

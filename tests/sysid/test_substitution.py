@@ -63,7 +63,7 @@ def test_exact_data_are_met_before_the_simpler_of_a_class_is_taken() -> None:
     """A Stribeck friction that has come near a Coulomb's path errs less than a Coulomb's first fit."""
     effects: list[Effect] = [CoulombFriction("hinge"), StribeckFriction("hinge")]
     data = recorded([CoulombFriction("hinge", level=0.08)], noise=0.0, exact=True)
-    s = Selector(problem(effects, data, noise=1e-5), None)
+    s = Selector(problem(effects, data, noise=1e-5))
     assert s.train.exact
     found = screen(s.train, s.fit_model((), s.train.score(s.train.null)).fit)
     assert found.alike(1) == [0]
@@ -76,7 +76,7 @@ def test_of_two_that_meet_exact_data_the_one_that_errs_far_less_is_right() -> No
     """A friction that gives way for a moment is a Coulomb's within the tolerance of exact data."""
     effects: list[Effect] = [CoulombFriction("hinge"), SoftFriction("hinge")]
     data = recorded([SoftFriction("hinge", level=0.08)], noise=0.0, exact=True)
-    s = Selector(problem(effects, data, noise=4e-3), None)
+    s = Selector(problem(effects, data, noise=4e-3))
     nothing = s.train.score(s.train.null)
     dry, soft = (s.refine(s.fit_model([i], nothing, 12)) for i in (0, 1))
     assert s.fits_exactly(dry)
@@ -119,7 +119,7 @@ def test_joints_are_built_alike(kept: tuple[int, ...]) -> None:
     effects: list[Effect] = [kind(j) for kind in (CoulombFriction, ViscousFriction) for j in joints]
     there = [CoulombFriction(j, level=level) for j, level in zip(joints, (0.1, 0.06, 0.03))]
     data = recorded(there, model, noise=0.0, exact=True)
-    s = Selector(problem(effects, data, noise=1e-5, model=model), None)
+    s = Selector(problem(effects, data, noise=1e-5, model=model))
     found = screen(s.train, s.fit_model((), s.train.score(s.train.null)).fit)
     wrong = s.fit_model(kept, s.train.fit(s.train.null, s.free(kept)))
     if 0 in kept:

@@ -7,15 +7,16 @@ from simulated import problem, recorded
 from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.sysid.selection import threshold_calibration
-from sb3_rpto.sysid.selection.stepwise_selection import LIKELY, Selector
+from sb3_rpto.sysid.selection.stepwise_selection import Selector
 from sb3_rpto.sysid.selection.threshold_calibration import calibrate_threshold, threshold_of_set
+from sb3_rpto.sysid.settings import DEFAULTS
 
 
 def selector(level: float) -> Selector:
     planted = [CoulombFriction("hinge", level=level)] if level else []
     effects = [CoulombFriction("hinge"), TorqueOffset("hinge")]
     train, select = (problem(effects, recorded(planted, seed=seed)) for seed in (0, 100))
-    return Selector(train, select, 3.5, lambda share, what: None)
+    return Selector(train, select)
 
 
 def test_what_is_in_the_data_does_not_raise_the_threshold() -> None:
@@ -46,7 +47,7 @@ def test_the_threshold_is_a_quantile_of_the_sets_and_no_less_than_that_of_a_test
     base = s.fit_model((), s.train.score(s.train.null)).fit
     ts = [threshold_of_set(s, base, [0, 1], seed) for seed in range(3, 6)]
     assert all(t >= 0 for t in ts)
-    assert calibrate_threshold(s, base, [0, 1], 3, 3) == max(LIKELY, np.quantile(ts, 0.95))
+    assert calibrate_threshold(s, base, [0, 1], 3, 3) == max(DEFAULTS.selection.threshold_far, np.quantile(ts, 0.95))
     monkeypatch.setattr(threshold_calibration, "threshold_of_set", lambda selector, base, chosen, seed: float(seed))
     assert calibrate_threshold(s, base, [0, 1], 3, 3) == pytest.approx(4.9)
 

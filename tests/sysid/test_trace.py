@@ -24,7 +24,7 @@ from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, ViscousFriction
 from sb3_rpto.effects.library import given
 from sb3_rpto.sysid import Measurements, Report, trace
-from sb3_rpto.sysid.problem.problem import LONGER, Assumptions, IdentificationProblem, Inputs, prepare
+from sb3_rpto.sysid.problem.problem import Assumptions, IdentificationProblem, Inputs, prepare
 from sb3_rpto.sysid.report.diagnostics import at_bounds
 from sb3_rpto.sysid.selection.adequacy import Adequacy, judge
 from sb3_rpto.sysid.selection.search import SelectorPair
@@ -250,7 +250,7 @@ def test_longer_windows_begin_where_the_others_do() -> None:
     data = recorded([], compiled(COARSE), 9, 3.2, rate=50)
     inputs = Inputs(COARSE, data, ["hinge.damping"], candidates=["coulomb_friction"], threads=1)
     made = prepare(inputs, Assumptions(simulated=True))
-    assert made.longer == LONGER * made.length
+    assert made.longer == 2 * made.length
     usual, longer = (SelectorPair.on(made, length).fine.train.windows for length in (made.length, made.longer))
     assert {tuple(q) for q in longer.qpos.round(9)} < {tuple(q) for q in usual.qpos.round(9)}
     assert len(longer) > 0.75 * len(usual)  # all but the last of each run

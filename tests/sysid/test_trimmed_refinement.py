@@ -1,5 +1,6 @@
 """Fits that contacts hold in kinks, led on: exact data of a walker, whose truth is known to the last digit."""
 
+from dataclasses import replace
 from functools import cache
 
 import gymnasium as gym
@@ -12,9 +13,10 @@ from sb3_rpto.effects import LIBRARY, Simulation, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Measurements, trace
 from sb3_rpto.sysid.problem.inverse_dynamics import force_residuals, typical
+from sb3_rpto.sysid.settings import DEFAULTS, RefinementSettings
 from sb3_rpto.sysid.shooting import trimmed_refinement
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
-from sb3_rpto.sysid.shooting.trimmed_refinement import ENOUGH, HOPS, WORTH, fit_lengthening, fit_trimmed
+from sb3_rpto.sysid.shooting.trimmed_refinement import fit_lengthening, fit_trimmed
 from sb3_rpto.sysid.shooting.windows import cut, discretised, noise_levels
 
 pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute")
@@ -22,6 +24,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute")
 NAMES = ["torso.length", "?thigh.length", "?shin.length", "?foot.length", "torso.mass"]
 TRUE = np.random.default_rng(0).uniform(0.8, 1.2, 8)  # shares of the nominal values
 HORIZON = 0.15
+
+SETTINGS = DEFAULTS.refinement
 
 
 @cache
@@ -60,8 +64,8 @@ def test_a_walkers_lengths_are_found_where_contacts_hold_a_plain_fit() -> None:
     plain = problem.fit(problem.null, free, iterations=100, tolerance=1e-9)
     led = fit_trimmed(problem, plain, free)
     assert problem.score(true).errors.max() < 1e-6  # the truth is there to be found
-    assert plain.errors.max() > 10 * ENOUGH  # and a descent does not get there
-    assert led.errors.max() < ENOUGH
+    assert plain.errors.max() > 10 * SETTINGS.enough  # and a descent does not get there
+    assert led.errors.max() < SETTINGS.enough
     np.testing.assert_allclose(led.values, true, rtol=1e-4)
 
 
@@ -92,9 +96,9 @@ def test_a_spring_about_a_far_angle_is_reached_by_windows_that_grow() -> None:
     begin = np.append(simulation.null[:3], [0.05, 1.0])
     free = np.arange(5)
     plain = on.fit(begin, free, iterations=40)
-    assert plain.errors.max() > 100 * ENOUGH
+    assert plain.errors.max() > 100 * SETTINGS.enough
     led = fit_lengthening(on, plain, free)
-    assert led.errors.max() < ENOUGH
+    assert led.errors.max() < SETTINGS.enough
     assert led.values[3:] == pytest.approx([0.3, -2.5], rel=1e-4)
     assert fit_lengthening(on, led, free) is led
     assert fit_lengthening(on, plain, free[:0]) is plain
@@ -139,7 +143,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Costs of the fits that would be fit_trimmed; none is."""
     costs: list[float] = []
 
-    def seen(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
+    def seen(problem: Problem, fit: Fit, free: np.ndarray, settings: RefinementSettings) -> Fit:
         costs.append(fit.cost)
         return fit
 
@@ -152,22 +156,24 @@ def test_exact_data_that_still_err_are_fitted_anew_beside_the_best_until_that_do
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     costs = counted(monkeypatch)
-    monkeypatch.setattr(trimmed_refinement, "ENOUGH", 0.0)
+    never = replace(SETTINGS, enough=0.0)
     problem = lengths().on(np.arange(0, 40, 4))
     free = np.arange(len(TRUE))
-    led = trimmed_refinement.refine(problem, problem.fit(problem.null, free, iterations=20), free)
+    led = trimmed_refinement.refine(problem, problem.fit(problem.null, free, iterations=20), free, never)
     best = np.minimum.accumulate(costs)
-    paid = np.array(costs[1:]) < WORTH * best[:-1]
+    paid = np.array(costs[1:]) < SETTINGS.worth * best[:-1]
     assert led.cost == min(costs)
-    assert not paid[-HOPS:].any()
-    assert all(paid[k : k + HOPS].any() for k in range(len(paid) - HOPS))
-    assert trimmed_refinement.refine(problem, problem.fit(problem.null, free, iterations=20), free).cost == led.cost
+    assert not paid[-SETTINGS.hops :].any()
+    assert all(paid[k : k + SETTINGS.hops].any() for k in range(len(paid) - SETTINGS.hops))
+    assert (
+        trimmed_refinement.refine(problem, problem.fit(problem.null, free, iterations=20), free, never).cost == led.cost
+    )
 
 
 def test_noisy_data_are_not_fitted_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     costs = counted(monkeypatch)
     noisy = problem(declare(compiled(), ["pole.mass"]), recorded([], noise=1e-3), noise=1e-3)
     far = noisy.score(2 * noisy.null)
-    assert far.errors.max() > ENOUGH
+    assert far.errors.max() > SETTINGS.enough
     assert trimmed_refinement.refine(noisy, far, np.arange(1)) is far
     assert len(costs) == 1

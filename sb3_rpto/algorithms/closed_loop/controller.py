@@ -23,9 +23,10 @@ from sb3_rpto.envs.env_copy import copy_env
 from sb3_rpto.envs.observations import single_env
 from sb3_rpto.sysid import Measurements, Report, trace
 from sb3_rpto.sysid.data.encoder_offsets import EncoderOffsets
-from sb3_rpto.sysid.problem.contacts import OFTEN, contact_changes
+from sb3_rpto.sysid.problem.contacts import contact_changes
 from sb3_rpto.sysid.problem.problem import Progress
 from sb3_rpto.sysid.selection.adequacy import SETTLED
+from sb3_rpto.sysid.settings import DEFAULTS
 from sb3_rpto.sysid.shooting.windows import noise_levels
 
 if TYPE_CHECKING:
@@ -420,7 +421,7 @@ def horizon_of(measured: Measurements, env: gym.Env) -> float:
 
 def window(measured: Measurements, contacts: float) -> int:
     """Number of samples in the windows of a trace of transitions with so many ``contacts`` that change a second."""
-    if measured.exact or contacts > OFTEN:
+    if measured.exact or contacts > DEFAULTS.problem.contact_changes:
         return WINDOW
     ends = [np.flatnonzero(~np.concatenate([[False], episode.placed, [False]])) for episode in measured.episodes]
     stretches = np.concatenate([np.diff(end) - 1 for end in ends])  # of samples whose positions are known

@@ -18,7 +18,8 @@ class BlocksOfAllRuns(Hypothesis):
         select, values = result.on.fine.select, result.selection.model.fit.values
         if result.substeps is not None or select is None or result.after.adequate:
             return False
-        return adequacy(select, select.score(values, iterations=START_STEPS), problem.inputs.seed).adequate
+        fit, settings = select.score(values, iterations=START_STEPS), problem.settings.adequacy
+        return adequacy(select, fit, problem.inputs.seed, settings).adequate
 
     def alternative(self, problem: IdentificationProblem, result: SearchResult) -> IdentificationProblem:
         """The same with no run set apart to select on."""

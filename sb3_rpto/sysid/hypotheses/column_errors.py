@@ -23,11 +23,6 @@ from sb3_rpto.sysid.selection.search import SearchResult
 from sb3_rpto.sysid.shooting.multiple_shooting import START_STEPS, Problem
 from sb3_rpto.sysid.shooting.windows import cut
 
-#: Another way of reading that leaves less than this share of the error is told.
-CLEARLY = 0.5
-#: Windows that ways of reading are compared in; so many that promise most are fitted, with so many iterations.
-WINDOWS, FITTED, ITERATIONS = 16, 3, 10
-
 
 @dataclass(frozen=True)
 class Reading:
@@ -104,13 +99,14 @@ class ColumnErrors(Hypothesis):
 
     def hints(self, problem: IdentificationProblem, result: SearchResult, fit: FinalFit) -> list[Finding]:
         """The way of reading by which the model errs far less, with what was found for it as far as that is needed."""
+        settings = problem.settings.hypotheses
         data, selector, model = problem.fitted, result.on.fine, result.selection.model
         simulation, scales, free = selector.simulation, selector.train.scales, selector.free(model.effects)
 
         def read(again: Callable[[Episode], Episode], order: Sequence[int]) -> Problem:
             episodes = [again(episode) for episode in data.episodes]
             noise = problem.sigma[list(order)]
-            windows = cut(simulation.model, replace(data, episodes=episodes), noise, selector.horizon, WINDOWS)
+            windows = cut(simulation.model, replace(data, episodes=episodes), noise, selector.horizon, settings.windows)
             return Problem(simulation, windows, scales)
 
         # The declared numbers alone may promise more: what was found makes up for the way of reading.
@@ -123,11 +119,11 @@ class ColumnErrors(Hypothesis):
             errors = [float(np.median(there.score(values).errors)) for values in begins]
             tried.append((min(errors), begins[int(np.argmin(errors))], there, reading))
         fitted = []
-        for _, values, there, reading in sorted(tried, key=lambda one: one[0])[:FITTED]:
-            tuned = there.fit(values, free, iterations=ITERATIONS)
+        for _, values, there, reading in sorted(tried, key=lambda one: one[0])[: settings.fitted]:
+            tuned = there.fit(values, free, iterations=settings.fitted_iterations)
             fitted.append((float(np.median(tuned.errors)) / usual, reading))
         share, best = min(fitted, key=lambda one: one[0], default=(np.inf, None))
-        if best is None or share > CLEARLY:
+        if best is None or share > settings.told_share:
             return []
         message = f"{best.what} the model errs by {share:.0%} of what it does: {best.remedy} and trace again"
         names = object_names(problem.nominal, "joint")

@@ -15,16 +15,14 @@ from sb3_rpto.sysid.data.encoder_offsets import EncoderOffsets
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.signal_quality import Finding
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
-from sb3_rpto.sysid.problem.problem import SELECT, TRAIN, IdentificationProblem
+from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.selection.adequacy import adequacy
 from sb3_rpto.sysid.selection.model_comparison import Evidence, compare, folds, unseen_errors
 from sb3_rpto.sysid.selection.search import SearchResult, SelectorPair, assess, search
 from sb3_rpto.sysid.selection.stepwise_selection import Model
+from sb3_rpto.sysid.settings import DEFAULTS, Settings
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
 from sb3_rpto.sysid.shooting.windows import cut
-
-#: Windows that the typical run must have: one tells its zero, and another is to confirm it.
-LEAST = 2
 
 
 class OffsetsOfRuns(Hypothesis):
@@ -41,7 +39,7 @@ class OffsetsOfRuns(Hypothesis):
         if data.exact or data.simulated or len(problem.runs) < 2 or not _joints(result):
             return False
         # Few select runs may have zeros like each other's.
-        return not (result.explains and _accounts_for_fitted(result, problem.inputs.seed))
+        return not (result.explains and _accounts_for_fitted(problem, result))
 
     def alternative(self, problem: IdentificationProblem, result: SearchResult) -> IdentificationProblem | None:
         """With the offsets taken off the fitted runs; None where none clearly differ."""
@@ -142,7 +140,7 @@ class _OffsetFit:
         """The windows and the model that a search ended with, in the usual steps in time."""
         selector, runs = result.on.fine, problem.runs
         if selector.simulation is not problem.fine:  # offsets show in kinks no more than elsewhere
-            selector = SelectorPair.on(problem, selector.horizon).fine
+            selector = SelectorPair.on(problem, selector.horizon, selector.settings).fine
         episodes = [problem.fitted.episodes[i] for i in selector.train.windows.episode]
         if selector.select is not None:
             episodes += [problem.split.select[i] for i in selector.select.windows.episode]
@@ -176,11 +174,12 @@ class _OffsetFit:
         :return: numbers of the joints; what their offsets gain together over none; the parameters with them
         """
         selector, windows = self.result.on.fine, self.problem.windows
-        parts, blocks = folds(windows, selector.horizon), windows.block
+        settings = selector.settings.comparison
+        parts, blocks = folds(windows, selector.horizon, settings.folds), windows.block
 
         def fitted(kept: Sequence[int], begin: Fit) -> tuple[Fit, np.ndarray]:
             fit = self.fit(kept, begin)
-            return fit, unseen_errors(self.problem, fit, self.free(kept), parts)
+            return fit, unseen_errors(self.problem, fit, self.free(kept), parts, settings.prior)
 
         first = self.problem.score(self.problem.begin(self.result.selection.model.fit.values))
         kept = list(range(len(self.problem.bias)))
@@ -188,16 +187,16 @@ class _OffsetFit:
         fit, errors = fitted(kept, begin)
         while kept:
             trials = {j: fitted([k for k in kept if k != j], fit) for j in kept}
-            evidence = {j: compare(trial[1], errors, blocks) for j, trial in trials.items()}
+            evidence = {j: compare(trial[1], errors, blocks, settings=settings) for j, trial in trials.items()}
             limit = selector.limit(Model((), fit, errors))
             weak = [j for j in kept if not evidence[j].clear(*limit)]
             if not weak:
                 break
             worst = min(weak, key=lambda j: evidence[j].t)
             kept, (fit, errors) = [k for k in kept if k != worst], trials[worst]
-        together = compare(without, errors, blocks)
+        together = compare(without, errors, blocks, settings=settings)
         # So many numbers fit a little of whatever lacks: far from the noise, too, all of t* is asked of them together.
-        return kept if together.t > selector.threshold else [], together, fit.values
+        return kept if together.t > selector.thresholds.threshold else [], together, fit.values
 
     def offsets(self, values: np.ndarray) -> np.ndarray:
         """What encoders show in each run beyond what the model says, rad or m, (R, J); 0 where no window is."""
@@ -211,7 +210,7 @@ def find_offsets(problem: IdentificationProblem, result: SearchResult) -> Encode
     joints = _joints(result)
     problem.inputs.say(0.8, "looking for encoder zeros that differ by run")
     task = _OffsetFit.of(problem, result, joints)
-    if np.median(np.bincount(task.problem.run)) < LEAST:
+    if np.median(np.bincount(task.problem.run)) < problem.settings.hypotheses.windows_of_a_run:
         return None
     kept, evidence, values = task.differing()
     if not kept:
@@ -231,6 +230,7 @@ def offsets_of(
     sigma: np.ndarray,
     horizon: float,
     joints: Sequence[str],
+    settings: Settings = DEFAULTS,
 ) -> EncoderOffsets:
     """The encoder offsets of other runs, by a model that is known.
 
@@ -240,6 +240,7 @@ def offsets_of(
     :param sigma: noise of the position columns, (m,)
     :param horizon: length of the windows in s
     :param joints: whose encoders they are
+    :param settings: thresholds
     :raises ValueError: a run has no episode that is as long as a window
     """
     windows = cut(simulation.model, data, sigma, horizon, sys.maxsize)
@@ -250,7 +251,8 @@ def offsets_of(
             f"runs {', '.join(without)} hold no window of {horizon:g} s: their zeros do not show; leave them out"
         )
     run = np.array([names.index(data.episodes[i].run) for i in windows.episode])
-    most = max(LEAST, (TRAIN + SELECT) // len(names))
+    every = settings.problem.train_windows + settings.problem.select_windows
+    most = max(settings.hypotheses.windows_of_a_run, every // len(names))
     chosen = np.sort(np.concatenate([_spread(np.flatnonzero(run == r), most) for r in range(len(names))]))
     windows, run = windows.take(chosen), run[chosen]
     task = ProblemWithOffsets(
@@ -276,12 +278,13 @@ def _joints(result: SearchResult) -> list[str]:
     ]
 
 
-def _accounts_for_fitted(result: SearchResult, seed: int) -> bool:
+def _accounts_for_fitted(problem: IdentificationProblem, result: SearchResult) -> bool:
     """Whether a model that accounts for the windows that it was judged on does so for those that it was fitted to."""
     if result.on.fine.select is None:
         return True  # they are the same
     train = result.on.fine.train
-    return adequacy(train, train.score(result.selection.model.fit.values), seed).adequate
+    fit = train.score(result.selection.model.fit.values)
+    return adequacy(train, fit, problem.inputs.seed, problem.settings.adequacy).adequate
 
 
 def _refit_offsets(problem: IdentificationProblem, result: SearchResult) -> tuple[IdentificationProblem, SearchResult]:
@@ -303,7 +306,7 @@ def _refit_offsets(problem: IdentificationProblem, result: SearchResult) -> tupl
     problem = problem.without_offsets(replace(before, offsets=task.offsets(fit.values)[rows]))
     stepped = problem.in_finer_steps() if finer else problem
     assert stepped is not None  # it was there for the search
-    on = SelectorPair.on(stepped, result.on.horizon, result.on.threshold)
+    on = SelectorPair.on(stepped, result.on.horizon, result.on.settings)
     model = on.fine.fit_model(model.effects, on.fine.train.score(values), iterations=10)
     after = assess(on.fine, model, problem.inputs.seed)
     return problem, replace(result, on=on, selection=replace(result.selection, model=model), after=after)

@@ -8,8 +8,6 @@ from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.selection.search import SearchResult
 
-#: Held forces are taken where they explain, or leave less than this share of the error.
-HELD_SHARE = 0.5
 #: Kinds that brake a joint in every substep and have a held form.
 TWINS = ("coulomb_friction", "soft_friction", "viscous_friction", "asymmetric_damping", "quadratic_drag")
 
@@ -29,7 +27,8 @@ class HeldForces(Hypothesis):
 
     def accepts(self, result: SearchResult, alternative: SearchResult) -> bool:
         """Where they explain, or halve the excess of the errors."""
-        return alternative.explains or alternative.after.ratio < HELD_SHARE * result.after.ratio
+        share = result.on.settings.hypotheses.clear_share
+        return alternative.explains or alternative.after.ratio < share * result.after.ratio
 
     def finding(self, alternative: IdentificationProblem, result: SearchResult) -> Finding | None:
         """That forces are held, where one that is was found."""

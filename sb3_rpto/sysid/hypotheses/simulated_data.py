@@ -48,7 +48,7 @@ class SimulatorSteps(Hypothesis):
         if result.explains or not result.selection.model.effects:
             return False
         asked, known = problem.inputs, kept_effects(result)
-        parameters = (asked.declared, problem.sigma, problem.length, asked.threads, known)
+        parameters = (asked.declared, problem.sigma, problem.length, asked.threads, known, problem.settings)
         return origin(problem.nominal, problem.fitted, *parameters) != "machine"
 
     def alternative(self, problem: IdentificationProblem, result: SearchResult) -> IdentificationProblem:
@@ -78,7 +78,7 @@ class ExactStates(Hypothesis):
         if not result.explains:
             return True
         asked = problem.inputs
-        parameters = (asked.declared, problem.length, asked.threads, kept_effects(result))
+        parameters = (asked.declared, problem.length, asked.threads, kept_effects(result), problem.settings)
         return met_exactly(problem.nominal, problem.fitted, *parameters)
 
     def alternative(self, problem: IdentificationProblem, result: SearchResult) -> IdentificationProblem:

@@ -11,18 +11,13 @@ from sb3_rpto.sysid.data.signal_quality import Finding
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.problem.unsupported_elements import Hint
-from sb3_rpto.sysid.selection.adequacy import TOLERANCE
 from sb3_rpto.sysid.selection.confidence_intervals import FinalFit
 from sb3_rpto.sysid.selection.search import SearchResult
+from sb3_rpto.sysid.settings import HypothesisSettings
 from sb3_rpto.sysid.shooting.multiple_shooting import Problem
 
 #: Kinds of dry friction at a joint.
 DRY = ("coulomb_friction", "stribeck_friction", "position_friction")
-#: A level of it that makes MuJoCo's own constraint act, and iterations of the fit.
-LITTLE, ITERATIONS = 1e-9, 8
-#: It is looked for where it leaves less than the first share of the error, or less than the second and no more than
-#: noise; a share below the second is told, too.
-SOFTER, LESS = 0.5, 0.95
 
 
 class SoftFriction(Hypothesis):
@@ -33,8 +28,11 @@ class SoftFriction(Hypothesis):
         if result.substeps is not None or result.explains:
             return False
         model = result.selection.model
-        share = share_of_creeping(result.on.fine.all_windows(), model.fit.values, model.effects)[1]
-        return share < SOFTER or (share < LESS and share * result.after.low <= 1 + TOLERANCE)
+        settings, tolerance = problem.settings.hypotheses, problem.settings.adequacy.tolerance
+        share = share_of_creeping(result.on.fine.all_windows(), model.fit.values, model.effects, settings)[1]
+        if share < settings.clear_share:
+            return True
+        return share < settings.some_share and share * result.after.low <= 1 + tolerance
 
     def alternative(self, problem: IdentificationProblem, result: SearchResult) -> IdentificationProblem:
         """With the same kinds of effects, friction that gives way in the place of the dry ones."""
@@ -57,8 +55,9 @@ class SoftFriction(Hypothesis):
         """Whether dry friction of a machine that gives way at rest would leave less."""
         if problem.data.simulated:
             return []
-        firm, share = share_of_creeping(fit.problem, fit.values, fit.named)
-        if share > LESS:
+        settings = problem.settings.hypotheses
+        firm, share = share_of_creeping(fit.problem, fit.values, fit.named, settings)
+        if share > settings.some_share:
             return []
         model = fit.problem.simulation.model
         message = (
@@ -71,7 +70,9 @@ class SoftFriction(Hypothesis):
         return [Hint("soft friction", ", ".join(e.label for e in firm), message, bodies=bodies, left=share)]
 
 
-def share_of_creeping(problem: Problem, values: np.ndarray, named: Sequence[int]) -> tuple[list[Effect], float]:
+def share_of_creeping(
+    problem: Problem, values: np.ndarray, named: Sequence[int], settings: HypothesisSettings
+) -> tuple[list[Effect], float]:
     """Dry friction, named or known, and the share of the error that is left where it is as MuJoCo's own.
 
     :param values: of the model that leaves something, (p,)
@@ -88,7 +89,7 @@ def share_of_creeping(problem: Problem, values: np.ndarray, named: Sequence[int]
     free = np.concatenate([np.arange(s.start, s.stop) for s in places])
     model = simulation.model.__copy__()
     # A joint that has some keeps its own constraint, see World.rough.
-    model.dof_frictionloss[[e.dof for e in firm]] = LITTLE
+    model.dof_frictionloss[[e.dof for e in firm]] = settings.little_friction
     soft = Simulation(model, simulation.effects, simulation.nthread)
-    fit = Problem(soft, problem.windows, problem.scales).fit(values, free, iterations=ITERATIONS)
+    fit = Problem(soft, problem.windows, problem.scales).fit(values, free, iterations=settings.iterations)
     return firm, float(np.median(fit.errors) / np.median(problem.score(values).errors))

@@ -8,7 +8,6 @@ from sb3_rpto.effects import Declared, Scales, Simulation
 from sb3_rpto.effects.library import candidates
 from sb3_rpto.effects.names import object_id
 from sb3_rpto.sysid.data.signal_quality import Finding
-from sb3_rpto.sysid.hypotheses.column_errors import CLEARLY, FITTED, ITERATIONS, WINDOWS
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.problem.unsupported_elements import Hint
@@ -17,9 +16,7 @@ from sb3_rpto.sysid.selection.search import SearchResult
 from sb3_rpto.sysid.shooting.multiple_shooting import Problem
 from sb3_rpto.sysid.shooting.windows import cut
 
-#: A body is looked at with these changes of each; those that promise most are fitted.
-LOOKS = (-0.3, 0.4)
-#: The effects that change them, and what to declare then.
+#: The effects that change a body's mass and inertia, and what to declare then.
 DECLARE = {"mass_scale": "mass", "inertia_scale": "inertia"}
 
 
@@ -35,24 +32,25 @@ class UndeclaredMass(Hypothesis):
         """
         if problem.data.exact:
             return []
+        settings = problem.settings.hypotheses
         selector, model = result.on.fine, result.selection.model
         simulation, scales = selector.simulation, selector.train.scales
-        windows = cut(simulation.model, problem.fitted, problem.sigma, selector.horizon, WINDOWS)
+        windows = cut(simulation.model, problem.fitted, problem.sigma, selector.horizon, settings.windows)
         begins = (model.fit.values, result.base.fit.values)  # what was found may make up for the mass
         free = selector.free(model.effects)
         as_it_is = Problem(simulation, windows, scales)  # fitted to these windows too, as with another mass
-        fits = [as_it_is.fit(values, free, iterations=ITERATIONS) for values in begins]
+        fits = [as_it_is.fit(values, free, iterations=settings.fitted_iterations) for values in begins]
         usual = min(float(np.median(fit.errors)) for fit in fits)
         declared = [effect.label for effect in simulation.effects if isinstance(effect, Declared)]
         tried = []
         for scale in candidates(problem.nominal, declared, DECLARE):
             wider = Simulation(simulation.model, [*simulation.effects, scale], simulation.nthread)
             there = Problem(wider, windows, [*scales, Scales()])
-            for values in (np.append(begin, change) for begin in begins for change in LOOKS):
+            for values in (np.append(begin, change) for begin in begins for change in settings.mass_changes):
                 tried.append((float(np.median(there.score(values).errors)), values, there, scale))
-        best, share = None, CLEARLY
-        for _, values, there, scale in sorted(tried, key=lambda one: one[0])[:FITTED]:
-            tuned = there.fit(values, np.append(free, simulation.size), iterations=ITERATIONS)
+        best, share = None, settings.told_share
+        for _, values, there, scale in sorted(tried, key=lambda one: one[0])[: settings.fitted]:
+            tuned = there.fit(values, np.append(free, simulation.size), iterations=settings.fitted_iterations)
             if (now := float(np.median(tuned.errors)) / usual) < share:
                 best, share = (scale, 1 + tuned.values[-1]), now
         if best is None:

@@ -8,8 +8,6 @@ import numpy as np
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.shooting.windows import names_of
 
-#: Contacts that change this often a second are said to come and go.
-OFTEN = 0.5
 #: Samples that are looked at, of all runs alike: contacts of one pose after the other.
 MOST = 5_000
 #: Geoms that touched have parted where their distance is so many times its noise, at least and at most these shares of

@@ -21,6 +21,7 @@ from sb3_rpto.sysid.data.inverse_dynamics_terms import actuation, inverse, throu
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.signal_quality import Finding, smoothed_velocity
 from sb3_rpto.sysid.problem.unsupported_elements import Hint, mocap_bodies, moved_by_mocap, of_actuator
+from sb3_rpto.sysid.settings import DEFAULTS, ProblemSettings
 from sb3_rpto.sysid.shooting.windows import command_order, discretised, stiff
 
 ALL = "all episodes"
@@ -56,7 +57,9 @@ _GAIN = 0.1  # by which a lag must improve it
 _SLOPE = 3.0  # needed and commanded force agree within this factor; a spring that the model lacks reverses them too
 
 
-def check_against(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
+def check_against(
+    model: mujoco.MjModel, data: Measurements, settings: ProblemSettings = DEFAULTS.problem
+) -> list[Finding]:
     """Check recordings against the model that is to explain them.
 
     Looked at: the names, the sampling, and by inverse dynamics of the smoothed motion whether each joint's actuators
@@ -75,7 +78,7 @@ def check_against(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
     check_clock(model, data)
     _check_settings(model, data)
     check_degrees(model, data)
-    return _sampling(model, data) + mocap_bodies(model) + _clipped(model, data) + _responses(model, data)
+    return _sampling(model, data, settings) + mocap_bodies(model) + _clipped(model, data) + _responses(model, data)
 
 
 def check_names(model: mujoco.MjModel, data: Measurements) -> None:
@@ -200,7 +203,7 @@ def _check_settings(model: mujoco.MjModel, data: Measurements) -> None:
                 )
 
 
-def _sampling(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
+def _sampling(model: mujoco.MjModel, data: Measurements, settings: ProblemSettings) -> list[Finding]:
     if not data.episodes:
         return []
     found = []
@@ -212,7 +215,7 @@ def _sampling(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
             f"one of {step / max(1, np.ceil(step / timestep)):.6g} s would be"
         )
         found.append(Finding("sampling", f"{ALL}, time", message))
-    if not (data.exact or data.simulated) and stiff(discretised(model, data, fine=False)):
+    if not (data.exact or data.simulated) and stiff(discretised(model, data, fine=False, settings=settings)):
         message = "too stiff for the Runge-Kutta method at this timestep: integrated implicitly, less finely"
         found.append(Finding("stiff model", "the model", message))
     if step > 1.01 * SLOW and not data.exact:

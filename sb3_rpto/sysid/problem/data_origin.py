@@ -15,23 +15,9 @@ from sb3_rpto.effects.library import given
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.problem.data_model_consistency import SLOW
 from sb3_rpto.sysid.problem.inverse_dynamics import force_residuals, typical
+from sb3_rpto.sysid.settings import DEFAULTS, OriginSettings, Settings
 from sb3_rpto.sysid.shooting.multiple_shooting import Problem
 from sb3_rpto.sysid.shooting.windows import cut, discretised, noise_levels
-
-#: Windows that are compared, and iterations of each fit.
-WINDOWS, ITERATIONS = 16, 10
-#: Typical window error, in units of the noise, that leaves nothing to ask.
-ENOUGH = 1.1
-#: They come from the model's own steps where those err by less than this share of what fine ones do, or, where they
-#: leave nothing to ask, by less than the second.
-CLEARLY, SOMEWHAT = 0.5, 0.8
-#: They may be exact where their noise is less than this share of what exact ones count as noisy by.
-NOISELESS = 0.03
-
-#: Nothing was commanded before the runs where less than this share of their first commands arrives in the first step.
-ARRIVES = 0.75
-#: By so many standard deviations of that share.
-CLEAR = 3.0
 
 Origin: TypeAlias = Literal["machine", "simulated", "exact"]
 
@@ -46,7 +32,9 @@ def may_be_exact(data: Measurements) -> bool:
     return not (data.whole_states or data.columns.missing or data.unobserved) and bool(step >= SLOW)
 
 
-def idle(simulation: Simulation, data: Measurements, sigma: np.ndarray) -> bool:
+def idle(
+    simulation: Simulation, data: Measurements, sigma: np.ndarray, settings: OriginSettings = DEFAULTS.origin
+) -> bool:
     """Whether runs of a simulator seem to begin without a command: not all of the first one acts in the first step.
 
     So it is where a queue of commands is empty at a reset, or a filter at rest. Where nothing is late, as in a weak
@@ -77,7 +65,7 @@ def idle(simulation: Simulation, data: Measurements, sigma: np.ndarray) -> bool:
     gained, seen = reached(1.0) - none, windows.measured[:, 0] / windows.sigma - none
     known = np.maximum((gained**2).sum(axis=1), 1e-12)
     arrives = float(np.median((gained * seen).sum(axis=1) / known))
-    return arrives + CLEAR / float(np.sqrt(known.sum())) < ARRIVES
+    return arrives + settings.arriving_deviations / float(np.sqrt(known.sum())) < settings.arriving_share
 
 
 def origin(
@@ -88,6 +76,7 @@ def origin(
     horizon: float,
     threads: int,
     known: Sequence[Effect] = (),
+    settings: Settings = DEFAULTS,
 ) -> Origin:
     """Whether recordings seem to be a machine's, or the model's own with noise, or without any.
 
@@ -104,19 +93,22 @@ def origin(
     :param threads: that simulate
     :param known: effects that it has besides, with the values to begin at
     """
-    steps = {(m.opt.timestep, m.opt.integrator) for m in (model, discretised(model, data, fine=True))}
+    limits = settings.origin
+    steps = {(m.opt.timestep, m.opt.integrator) for m in (model, discretised(model, data, True, settings.problem))}
     if data.exact or len(steps) == 1:
         return "machine"
 
-    fit = partial(_error, model, declared=declared, horizon=horizon, threads=threads, known=known)
+    fit = partial(_error, model, declared=declared, horizon=horizon, threads=threads, known=known, settings=settings)
     continuous = fit(data, sigma)
-    if continuous < ENOUGH:
+    if continuous < limits.enough:
         return "machine"
     own = fit(replace(data, simulated=True), sigma)
-    if own > (SOMEWHAT if own < ENOUGH else CLEARLY) * continuous:
+    if own > (limits.share_where_enough if own < limits.enough else limits.clear_share) * continuous:
         return "machine"
-    noiseless = bool(np.all(sigma < NOISELESS * noise_levels(replace(data, exact=True, noise=None))))
-    return "exact" if noiseless and met_exactly(model, data, declared, horizon, threads, known) else "simulated"
+    noiseless = bool(np.all(sigma < limits.noiseless * noise_levels(replace(data, exact=True, noise=None))))
+    return (
+        "exact" if noiseless and met_exactly(model, data, declared, horizon, threads, known, settings) else "simulated"
+    )
 
 
 def met_exactly(
@@ -126,13 +118,15 @@ def met_exactly(
     horizon: float,
     threads: int,
     known: Sequence[Effect] = (),
+    settings: Settings = DEFAULTS,
 ) -> bool:
     """Whether the model's own steps lead from the states of recordings to those after them, but for rounding.
 
     Parameters as of :func:`origin`.
     """
     exact = replace(data, exact=True, noise=None)
-    return _error(model, exact, noise_levels(exact), declared, horizon, threads, known) < ENOUGH
+    error = _error(model, exact, noise_levels(exact), declared, horizon, threads, known, settings)
+    return error < settings.origin.enough
 
 
 def _error(
@@ -143,11 +137,12 @@ def _error(
     horizon: float,
     threads: int,
     known: Sequence[Effect],
+    settings: Settings,
 ) -> float:
     """Typical error of some windows, in units of the noise, where the declared parameters and ``known`` are fitted."""
-    stepped = discretised(model, data, fine=True)
+    stepped = discretised(model, data, True, settings.problem)
     simulation = Simulation(stepped, given(stepped, declared, known), threads)
     scales = typical(simulation, force_residuals(simulation, simulation.null, data)).scales(simulation.effects)
-    problem = Problem(simulation, cut(stepped, data, noise, horizon, WINDOWS), scales)
-    fit = problem.fit(simulation.null, np.flatnonzero(simulation.strength), iterations=ITERATIONS)
+    problem = Problem(simulation, cut(stepped, data, noise, horizon, settings.origin.windows), scales)
+    fit = problem.fit(simulation.null, np.flatnonzero(simulation.strength), iterations=settings.origin.iterations)
     return float(np.median(fit.errors))

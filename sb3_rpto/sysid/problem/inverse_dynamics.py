@@ -128,7 +128,7 @@ def _motion(
             dof = dof_of[int(address)]
             shown[:, dof] = path
             qvel[:, dof] = np.gradient(path, h)
-    for column, dof in enumerate(velocity_addresses(model, data)):
+    for column, dof in enumerate(velocity_addresses(model, data.columns)):
         if data.whole_states or dof not in dof_of.values():  # quaternions are not differentiated
             qvel[:, dof] = low(np.interp(time, e.time, e.qvel[:, column]))
     return qpos, qvel, shown

@@ -26,30 +26,12 @@ from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
 from sb3_rpto.sysid.data.sample_clock import settle_clock
 from sb3_rpto.sysid.data.signal_quality import Finding
-from sb3_rpto.sysid.problem.contacts import OFTEN, contact_changes
+from sb3_rpto.sysid.problem.contacts import contact_changes
 from sb3_rpto.sysid.problem.data_model_consistency import carried_weights, check_against, soft_friction, soft_ties
 from sb3_rpto.sysid.problem.data_origin import idle, origin
 from sb3_rpto.sysid.problem.inverse_dynamics import force_residuals, typical
+from sb3_rpto.sysid.settings import DEFAULTS, ProblemSettings, Settings
 from sb3_rpto.sysid.shooting.windows import BLOCK, MEMORY, Windows, cut, discretised, noise_levels, step_for
-
-#: Most windows to fit, and to select on.
-TRAIN, SELECT = 40, 40
-#: Few windows overlap by this share.
-OVERLAP = 2 / 3
-#: Seconds of training data that count as short.
-SHORT = 15.0
-#: Fewer windows than this overlap.
-FEW = 40
-#: Where contacts come and go, windows are so many seconds long: an error about the moment of a touch-down grows to far
-#: more than noise.
-BRIEF = 0.1
-#: And so many times as many.
-MANY = 4
-#: Where steps in time seem to err by more than the noise, others so many times as short are tried.
-SHORTER = 4
-#: Where what is found leaves errors far above the noise, windows so many times as long show more of what is missing,
-#: and what only stands in for it shows too.
-LONGER = 2
 
 Progress = Callable[[float, str], None]
 
@@ -72,6 +54,7 @@ class Inputs:
     calibrate: int = 0
     threads: int = 0
     say: Progress = silent
+    settings: Settings = DEFAULTS
 
 
 @dataclass(frozen=True)
@@ -162,6 +145,11 @@ class IdentificationProblem:
         return tuple(dict.fromkeys(episode.run for episode in self.fitted.episodes))
 
     @property
+    def settings(self) -> Settings:
+        """Thresholds."""
+        return self.inputs.settings
+
+    @property
     def kinds(self) -> Sequence[str] | None:
         """Kinds of effects that are looked for; None: all that are offered."""
         return self.inputs.candidates if self.assumptions.kinds is None else self.assumptions.kinds
@@ -191,7 +179,7 @@ class IdentificationProblem:
         if self.data.exact or self.data.simulated:
             return None
         nominal = self.fine.model.__copy__()
-        nominal.opt.timestep /= SHORTER
+        nominal.opt.timestep /= self.settings.problem.finer_steps
         return replace(self, fine=Simulation(nominal, self.fine.effects, self.fine.nthread))
 
     def in_simulator_steps(self, substeps: int) -> IdentificationProblem | None:
@@ -226,16 +214,18 @@ class IdentificationProblem:
         return self._cut[key]
 
     def _windows(self, model: mujoco.MjModel, horizon: float, overlap: float) -> tuple[Windows, Windows | None]:
-        many = MANY if self.data.touching else 1
+        settings = self.settings.problem
+        many = settings.contact_windows if self.data.touching else 1
         if any(e.time[-1] - e.time[0] >= 2 * horizon for e in self.split.select):
-            judging = cut(model, self.select, self.sigma, horizon, many * SELECT, overlap)
+            judging = cut(model, self.select, self.sigma, horizon, many * settings.select_windows, overlap)
             # A single block is no evidence for anything.
             if len(np.unique(judging.block)) > 1:
-                return cut(model, self.train, self.sigma, horizon, many * TRAIN, overlap), judging
-        every = cut(model, self.fitted, self.sigma, horizon, many * (TRAIN + SELECT), overlap)
-        few = len(every) < FEW
+                return cut(model, self.train, self.sigma, horizon, many * settings.train_windows, overlap), judging
+        most = many * (settings.train_windows + settings.select_windows)
+        every = cut(model, self.fitted, self.sigma, horizon, most, overlap)
+        few = len(every) < settings.few_windows
         if few:
-            every = cut(model, self.fitted, self.sigma, horizon, 2 * FEW, overlap=OVERLAP)
+            every = cut(model, self.fitted, self.sigma, horizon, 2 * settings.few_windows, overlap=settings.overlap)
         # Some hundred transitions of a simulator are soon over, and tell much.
         if (few or not self.data.whole_states) and len(np.unique(every.block)) < 3:
             enough = sum(float(np.ptp(e.time)) for e in self.fitted.episodes) > 2 * BLOCK  # for a third block to begin
@@ -249,8 +239,9 @@ class IdentificationProblem:
 
     def _longer_windows(self) -> float | None:
         """Length of the windows to go on with, in s, where the data hold enough of them to select on."""
-        longer = LONGER * self.length
-        if sum(int((e.time[-1] - e.time[0]) / longer) for e in self.fitted.episodes) < FEW // 2:
+        settings = self.settings.problem
+        longer = settings.longer_windows * self.length
+        if sum(int((e.time[-1] - e.time[0]) / longer) for e in self.fitted.episodes) < settings.few_windows // 2:
             return None
         try:
             self.windows(self.rough, longer)
@@ -264,7 +255,7 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
 
     :raises ValueError: data and model do not fit together, or the data are too few
     """
-    declared, known, threads = inputs.declared, inputs.known, inputs.threads
+    declared, known, threads, settings = inputs.declared, inputs.known, inputs.threads, inputs.settings.problem
     spec, compiled = load_model(inputs.model)
     data = replace(
         inputs.data,
@@ -274,9 +265,9 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
     )
     data, turned = settle_turns(compiled, data)
     data, clock = settle_clock(data)
-    findings = [*data.findings, *turned, *clock, *check_against(compiled, data), *_own_step(inputs.model)]
+    findings = [*data.findings, *turned, *clock, *check_against(compiled, data, settings), *_own_step(inputs.model)]
     given(compiled, declared, known)  # what is wrong there is said before the work
-    roomy = with_room(spec, compiled, data)
+    roomy = with_room(spec, compiled, data, settings)
     parts = data.split(inputs.seed)
     split = Split(*(part.episodes for part in parts))
     findings += [f for f in parts[0].findings if f not in findings]
@@ -288,13 +279,15 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
         findings += [Finding("at rest", f"fitted runs, qpos.{name}", message) for name in resting]
     sigma = noise_levels(fitted)
     changes = contact_changes(compiled, fitted, sigma)
-    touching = changes > OFTEN
-    length = _horizon(fitted, touching) if inputs.horizon is None else float(inputs.horizon)
+    touching = changes > settings.contact_changes
+    length = _horizon(fitted, touching, settings) if inputs.horizon is None else float(inputs.horizon)
     if touching and inputs.horizon is None:
         message = f"{changes:.1f} a second come or go; windows of {length:.2g} s, as errors about a touch-down grow"
         findings.append(Finding("contacts", "fitted runs", message))
     # What was told need not be found out.
-    seems = "told" if data.simulated else origin(roomy, fitted, declared, sigma, length, threads, known)
+    seems = (
+        "told" if data.simulated else origin(roomy, fitted, declared, sigma, length, threads, known, inputs.settings)
+    )
     if seems in ("simulated", "exact"):
         exact = seems == "exact"
         data = replace(data, simulated=True, exact=exact, noise=None if exact else data.noise)
@@ -304,7 +297,7 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
         findings.append(Finding("simulated", "fitted runs", message))
     data = replace(data, touching=touching and not data.exact)  # those are met, or fits begin anew until they are
     fitted = replace(data, episodes=fitted.episodes)
-    nominal = discretised(roomy, fitted, fine=True)
+    nominal = discretised(roomy, fitted, fine=True, settings=settings)
     there = given(nominal, declared, known, assumptions.soft_friction)
     if seems == "machine" and not data.exact:
         findings += soft_friction(nominal) + soft_ties(nominal) + carried_weights(nominal)
@@ -312,12 +305,12 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
     effects = _effects(nominal, data, there, kinds)
     findings += _without_a_place(nominal, kinds)
     fine = Simulation(nominal, effects, threads)
-    if (data.exact or data.simulated) and idle(fine, fitted, sigma):
+    if (data.exact or data.simulated) and idle(fine, fitted, sigma, inputs.settings.origin):
         data = replace(data, idle=True)
     scales = typical(fine, force_residuals(fine, fine.null, replace(data, episodes=fitted.episodes))).scales(
         fine.effects
     )
-    rough = Simulation(discretised(roomy, fitted, fine=False), effects, threads)
+    rough = Simulation(discretised(roomy, fitted, fine=False, settings=settings), effects, threads)
     problem = IdentificationProblem(
         inputs, assumptions, spec, compiled, findings, data, split, sigma, fine, rough, scales, length
     )
@@ -366,7 +359,12 @@ def _own_step(model: Any) -> list[Finding]:
     return [Finding("own step", "step() of the environment", message)]
 
 
-def with_room(spec: mujoco.MjSpec | None, compiled: mujoco.MjModel, data: Measurements) -> mujoco.MjModel:
+def with_room(
+    spec: mujoco.MjSpec | None,
+    compiled: mujoco.MjModel,
+    data: Measurements,
+    settings: ProblemSettings = DEFAULTS.problem,
+) -> mujoco.MjModel:
     """The model, whose delayed actuators hold as many commands as the shorter steps of measured data take.
 
     MuJoCo keeps ``nsample`` of them, one for each step: in shorter ones as many span less than the delay.
@@ -378,7 +376,11 @@ def with_room(spec: mujoco.MjSpec | None, compiled: mujoco.MjModel, data: Measur
     """
     if data.substeps == 1 and (data.exact or data.simulated):
         return compiled
-    step = compiled.opt.timestep / data.substeps if data.simulated else step_for(compiled, data) / SHORTER
+    step = (
+        compiled.opt.timestep / data.substeps
+        if data.simulated
+        else step_for(compiled, data, settings) / settings.finer_steps
+    )
     needed = np.ceil(compiled.actuator_delay / step - 1e-9).astype(int)
     lacking = np.flatnonzero(needed > np.where(compiled.actuator_delay > 0, compiled.actuator_history[:, 0], needed))
     if not len(lacking):
@@ -431,15 +433,15 @@ def _candidates(
     return [e for e in found if e.label not in labels]
 
 
-def _horizon(data: Measurements, touching: bool) -> float:
+def _horizon(data: Measurements, touching: bool, settings: ProblemSettings) -> float:
     """Half a second, at least eight samples, at most a third of the longest episode.
 
     Short data take 0.8 s: an effect shows more against the noise of so few windows. Where contacts come and go,
-    :data:`BRIEF`, at least three steps from sample to sample.
+    a tenth of a second, at least three steps from sample to sample.
     """
     step = data.step
     if touching:
-        return max(BRIEF, 3 * step)
+        return max(settings.contact_horizon, 3 * step)
     lengths = [float(e.time[-1] - e.time[0]) for e in data.episodes]
-    usual = 0.5 if sum(lengths) >= SHORT else 0.8
+    usual = settings.horizon if sum(lengths) >= settings.short_data else settings.horizon_of_short_data
     return min(max(usual, 8 * step), max(max(lengths) / 3, 3 * step))

@@ -12,7 +12,7 @@ from sb3_rpto.effects.actuation import GAINS, JOINTS, on_voltage
 from sb3_rpto.effects.bodies import may_touch
 from sb3_rpto.effects.names import SCALAR_JOINTS, object_names
 from sb3_rpto.sysid.data.signal_quality import Finding, listed
-from sb3_rpto.sysid.report.descriptions import SMALL
+from sb3_rpto.sysid.settings import DEFAULTS
 
 _JOINTS = {int(mujoco.mjtJoint.mjJNT_BALL): "ball joint", int(mujoco.mjtJoint.mjJNT_FREE): "free joint"}
 _TIES = {
@@ -71,7 +71,9 @@ def unreached(model: mujoco.MjModel) -> list[Thing]:
     return [thing for thing in things if any(model.body_treeid[b] >= 0 for b in thing.bodies)]
 
 
-def instead(model: mujoco.MjModel, hints: Sequence[Finding], ratio: float) -> list[Finding]:
+def instead(
+    model: mujoco.MjModel, hints: Sequence[Finding], ratio: float, small: float = DEFAULTS.adequacy.small
+) -> list[Finding]:
     """What may be wrong where nothing explains recordings: what nothing acts on, or what the hints say.
 
     A hint is withheld where what it concerns hangs together with something that nothing acts on, unless it leaves next
@@ -80,6 +82,7 @@ def instead(model: mujoco.MjModel, hints: Sequence[Finding], ratio: float) -> li
     :param model: of the machine
     :param hints: those of :class:`Hint` are looked at, others are passed on
     :param ratio: R, of the errors with all that was found
+    :param small: below it R is next to nothing
     """
     things = unreached(model)
     trees = {int(model.body_treeid[b]) for thing in things for b in thing.bodies}
@@ -90,7 +93,7 @@ def instead(model: mujoco.MjModel, hints: Sequence[Finding], ratio: float) -> li
     kept, explained = [], False
     for hint in hints:
         if isinstance(hint, Hint) and beside(hint.bodies):
-            if not hint.left * ratio < SMALL:
+            if not hint.left * ratio < small:
                 continue
             explained = True
         kept.append(hint)

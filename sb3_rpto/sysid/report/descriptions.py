@@ -12,7 +12,7 @@ from sb3_rpto.effects import Effect, Parameter
 from sb3_rpto.effects.names import SCALAR_JOINTS, object_id, object_names
 from sb3_rpto.effects.units import joint_of
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.selection.adequacy import TOLERANCE, Adequacy
+from sb3_rpto.sysid.selection.adequacy import Adequacy
 
 #: For each verdict what it means, and what it does not mean.
 VERDICTS = {
@@ -36,15 +36,12 @@ VERDICTS = {
     ),
 }
 
-#: Below it the ratio of errors to those of noise tells of something small.
-SMALL = 1.5
-
 
 def rest(after: Adequacy) -> list[str]:
     """In a sentence how small what remains is; none where nothing does, or where it is not small."""
-    if after.adequate or after.ratio >= SMALL:
+    if after.adequate or after.ratio >= after.settings.small:
         return []
-    if after.ratio <= 1 + TOLERANCE:
+    if after.ratio <= 1 + after.settings.tolerance:
         few = percent(after.strays)
         return [f"The typical window errs by no more than noise: what remains is in {few} of windows."]
     share = percent(after.ratio - 1)

@@ -15,8 +15,9 @@ from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.signal_quality import Finding, listed
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.report import descriptions
-from sb3_rpto.sysid.selection.adequacy import BEYOND, TOLERANCE, Adequacy
+from sb3_rpto.sysid.selection.adequacy import Adequacy
 from sb3_rpto.sysid.selection.stepwise_selection import Selector
+from sb3_rpto.sysid.settings import DEFAULTS
 from sb3_rpto.sysid.shooting.multiple_shooting import START_STEPS, Problem
 from sb3_rpto.sysid.shooting.prediction_errors import HorizonError, horizon_errors, noise_floor, observed, predictions
 from sb3_rpto.sysid.shooting.windows import cut
@@ -97,7 +98,7 @@ def above_noise(after: list[HorizonError], floor: list[HorizonError], ratio: flo
     errors = {error.horizon: error.low for error in after}
     long = [level for level in floor if float(level.horizon) >= length / 2]
     clear = [level for level in long if np.any(errors[level.horizon] > level.high)]
-    if ratio <= 1 + TOLERANCE or not clear:
+    if ratio <= 1 + DEFAULTS.adequacy.tolerance or not clear:
         return []
     message = (
         f"R is {ratio:.2f}, and in {clear[0].horizon:g} s the test runs err clearly more than noise leaves: so few "
@@ -134,7 +135,7 @@ def strays(
     fits = [problem.score(values) for problem, _ in parts]
     errors = np.concatenate([fit.errors for fit in fits])
     noise = np.concatenate([problem.noise_errors(fit, seed).ravel() for (problem, _), fit in zip(parts, fits)])
-    limit = max(BEYOND * float(np.quantile(noise, 0.99)), APART * float(np.median(errors)))
+    limit = max(after.settings.stray_factor * float(np.quantile(noise, 0.99)), APART * float(np.median(errors)))
     runs = np.array([data.episodes[i].run for problem, data in parts for i in problem.windows.episode])
     stray = errors > limit
     whole = [run for run in sorted({*runs[stray]}) if stray[runs == run].mean() > 0.5]

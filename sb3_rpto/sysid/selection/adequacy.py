@@ -7,14 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import binom
 
+from sb3_rpto.sysid.settings import DEFAULTS, AdequacySettings
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
 
-#: R may exceed one by so much: the noise is estimated, too.
-TOLERANCE = 0.06
-#: Saturation is rare and hides in medians: windows are counted whose error exceeds by a quarter what noise alone
-#: exceeds in one of a hundred. More than twice as many as that, beyond chance, are too many.
-BEYOND, RARE, CHANCE = 1.25, 0.02, 1e-3
-RESAMPLES = 400
 #: Verdicts that leave nothing to look for.
 SETTLED = ("complete", "explained")
 
@@ -29,6 +24,7 @@ class Adequacy:
     :param strays: share of windows whose error noise does not explain
     :param chance: of as many of them by noise alone
     :param spread: whether several episodes have such windows
+    :param settings: thresholds
     """
 
     ratio: float
@@ -37,16 +33,17 @@ class Adequacy:
     strays: float
     chance: float
     spread: bool = False
+    settings: AdequacySettings = DEFAULTS.adequacy
 
     @property
     def adequate(self) -> bool:
         """Whether the ratio reaches down to one, within the tolerance of the noise estimate, with few stray windows."""
-        return self.low <= 1 + TOLERANCE and self.chance > CHANCE
+        return self.low <= 1 + self.settings.tolerance and self.chance > self.settings.chance
 
     @property
     def denied_by_strays(self) -> bool:
         """Whether the typical error is no more than noise, and single windows alone say that something is missing."""
-        return self.low <= 1 + TOLERANCE and not self.adequate
+        return self.low <= 1 + self.settings.tolerance and not self.adequate
 
     def __str__(self) -> str:
         return f"R = {self.ratio:.2f} [{self.low:.2f}, {self.high:.2f}]"
@@ -61,11 +58,11 @@ def counted_with(select: Adequacy, few: int, fitted: Adequacy, more: int) -> Ade
     :param fitted: of the ``more`` windows
     """
     strays = round(select.strays * few) + round(fitted.strays * more)
-    chance = float(binom.sf(strays - 1, few + more, RARE))
+    chance = float(binom.sf(strays - 1, few + more, select.settings.stray_share))
     return replace(select, strays=strays / (few + more), chance=min(select.chance, chance))
 
 
-def adequacy(problem: Problem, fit: Fit, seed: int) -> Adequacy:
+def adequacy(problem: Problem, fit: Fit, seed: int, settings: AdequacySettings = DEFAULTS.adequacy) -> Adequacy:
     """Compare the errors of a fit with those of noise alone.
 
     :param problem: windows that the parameters were not fitted to, with their starts fitted
@@ -78,24 +75,25 @@ def adequacy(problem: Problem, fit: Fit, seed: int) -> Adequacy:
     names = np.unique(blocks)
     members = [np.flatnonzero(blocks == b) for b in names]
     medians = []
-    for _ in range(RESAMPLES):
+    for _ in range(settings.resamples):
         rows = np.concatenate([members[i] for i in rng.integers(len(names), size=len(names))])
         medians.append(np.median(fit.errors[rows]))
     ratio = float(np.median(fit.errors)) / typical
     low, high = np.quantile(medians, [0.025, 0.975]) / typical
     # Two or three blocks, resampled, say next to nothing; noise in so few windows is known without them.
-    noisy = np.median(rng.choice(noise.ravel(), (RESAMPLES, len(fit.errors))), axis=1) / typical
+    noisy = np.median(rng.choice(noise.ravel(), (settings.resamples, len(fit.errors))), axis=1) / typical
     least, most = np.quantile(noisy, [0.025, 0.975])
     low, high = min(low, ratio / most), max(high, ratio / least)
-    stray = fit.errors > BEYOND * np.quantile(noise, 0.99)
+    stray = fit.errors > settings.stray_factor * np.quantile(noise, 0.99)
     count = int(stray.sum()) if len(np.unique(blocks[stray])) > 1 else 0
     return Adequacy(
         ratio,
         float(low),
         float(high),
         float(stray.mean()),
-        float(binom.sf(count - 1, len(stray), RARE)),
+        float(binom.sf(count - 1, len(stray), settings.stray_share)),
         len(np.unique(problem.windows.episode[stray])) > 1,
+        settings,
     )
 
 
@@ -110,7 +108,7 @@ def judge(before: Adequacy, after: Adequacy, named: bool) -> str:
         return "complete" if before.adequate else "unexplained"
     if after.adequate:
         return "explained"
-    if before.ratio <= 1 + TOLERANCE:  # only stray windows deny that it is complete
+    if before.ratio <= 1 + before.settings.tolerance:  # only stray windows deny that it is complete
         halved = after.strays <= 0.5 * before.strays
     else:
         halved = np.log(max(after.ratio, 1.0)) <= 0.5 * np.log(before.ratio)

@@ -12,13 +12,9 @@ from sb3_rpto.fitting.loss import Loss
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.selection.search import SearchResult
 from sb3_rpto.sysid.selection.stepwise_selection import Selection, Selector
+from sb3_rpto.sysid.settings import DEFAULTS, SelectionSettings
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Linear, Problem
 from sb3_rpto.sysid.shooting.trimmed_refinement import NOTHING
-
-#: What rests on fewer blocks has no interval: one alone does not scatter.
-LEAST = 1.5
-#: Most iterations of the last fits: where two parameters do nearly the same, a descent goes slowly along their valley.
-FINAL = 40
 
 
 @dataclass(frozen=True)
@@ -50,15 +46,20 @@ def refit(problem: IdentificationProblem, result: SearchResult) -> FinalFit:
     problem.inputs.say(0.85, "fitting the final model")
     selector, named = result.on.fine, result.selection.model.effects
     windows = selector.all_windows()
-    values, intervals, correlation = fit_with_intervals(result.selection, windows)
+    settings = problem.settings.selection
+    values, intervals, correlation = fit_with_intervals(result.selection, windows, settings)
     # Both models are fitted to all these data before they are compared on the test runs, the declared one as recorded.
     recorded = windows if result.as_recorded is None else result.first.on.fine.all_windows()
-    declared = recorded.fit(result.first.base.fit.values, selector.free(()), iterations=FINAL, crude=0.0).values
+    declared = recorded.fit(
+        result.first.base.fit.values, selector.free(()), iterations=settings.final_iterations, crude=0.0
+    ).values
     free = selector.free(named)
     return FinalFit(windows, declared, values, intervals, correlation, named, free, selector.horizon)
 
 
-def fit_with_intervals(selection: Selection, problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fit_with_intervals(
+    selection: Selection, problem: Problem, settings: SelectionSettings = DEFAULTS.selection
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit on train and select together.
 
     Of what was given and only shows together, the last one stays what it was.
@@ -69,13 +70,13 @@ def fit_with_intervals(selection: Selection, problem: Problem) -> tuple[np.ndarr
     """
     joined = problem.windows
     free = Selector(problem, problem).free(selection.model.effects)
-    fit = problem.fit(selection.model.fit.values, free, iterations=FINAL, crude=0.0)
+    fit = problem.fit(selection.model.fit.values, free, iterations=settings.final_iterations, crude=0.0)
     alike, held = not_told_apart(problem, fit, free)
     if len(held):
         begin = fit.values.copy()
         begin[held] = problem.null[held]
         free = np.setdiff1d(free, held)
-        fit = problem.fit(begin, free, iterations=FINAL, crude=0.0)
+        fit = problem.fit(begin, free, iterations=settings.final_iterations, crude=0.0)
     values, intervals = fit.values.copy(), np.full((2, len(fit.values)), np.nan)
     correlation = np.eye(len(values))
     if len(free):
@@ -85,7 +86,9 @@ def fit_with_intervals(selection: Selection, problem: Problem) -> tuple[np.ndarr
         values[hidden] = problem.null[hidden]
         r = problem.residuals(np.tile(fit.values, (len(joined), 1)), fit.starts, np.arange(len(joined)))
         r = r[np.repeat(joined.usable, joined.measured.shape[2], axis=1)]
-        half = half_widths(linear, joined.block) * problem.size[free] / Loss.of(r).curvature(r)
+        half = (
+            half_widths(linear, joined.block, settings.interval_blocks) * problem.size[free] / Loss.of(r).curvature(r)
+        )
         intervals[:, free] = fit.values[free] + np.array([-1, 1])[:, None] * half
         intervals = np.clip(intervals, problem.lower, problem.upper)
         intervals[:, hidden] = intervals[:, alike] = np.nan
@@ -105,7 +108,7 @@ def correlations(covariance: np.ndarray) -> np.ndarray:
     return np.asarray(found)
 
 
-def half_widths(linear: Linear, block: np.ndarray) -> np.ndarray:
+def half_widths(linear: Linear, block: np.ndarray, least: float = DEFAULTS.selection.interval_blocks) -> np.ndarray:
     r"""Half-widths of 95 % intervals of the free parameters at a fit, in plausible sizes, (f,).
 
     Errors within a block go together, those of different blocks do not. So the estimate's variance is that of the sum
@@ -115,7 +118,8 @@ def half_widths(linear: Linear, block: np.ndarray) -> np.ndarray:
 
     :param linear: the cost around the fit
     :param block: number of the block of each window, (W,)
-    :return: NaN where fewer than :data:`LEAST` blocks tell a parameter
+    :param least: blocks that must tell a parameter
+    :return: NaN where fewer do
     """
     inverse = _inverse(linear.normal.sum(0))
     members = [block == b for b in np.unique(block)]
@@ -126,7 +130,7 @@ def half_widths(linear: Linear, block: np.ndarray) -> np.ndarray:
     count = told.sum(0) ** 2 / np.maximum((told**2).sum(0), np.finfo(float).tiny)
     with np.errstate(invalid="ignore", divide="ignore"):
         spread = np.sqrt((moves**2).sum(0) * count / (count - 1)) * student.ppf(0.975, np.maximum(count - 1, 1))
-    return np.where(count < LEAST, np.nan, spread)
+    return np.where(count < least, np.nan, spread)
 
 
 def _inverse(normal: np.ndarray) -> np.ndarray:

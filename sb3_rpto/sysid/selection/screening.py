@@ -7,14 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_rpto.fitting.loss import Loss
+from sb3_rpto.sysid.settings import DEFAULTS, ScreeningSettings
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
-
-#: A candidate of plausible size that moves all residuals together by less than this many units of noise is not excited.
-EXCITED = 4.0
-#: Candidates whose influences are closer than this are one class.
-SAME = 0.98
-#: Digits of likenesses: of what is alike up to rounding, the first in the library's order is the likest.
-DIGITS = 9
 
 
 @dataclass(frozen=True)
@@ -24,23 +18,25 @@ class Screening:
     :param sensitivity: of each effect of the simulation, in units of noise for an effect of plausible size, (e,)
     :param cosine: likeness of the influences of effects, (e, e), 1 on the diagonal
     :param taken: of each effect that shows only in what declared parameters do, the likest of them, else None, (e,)
+    :param settings: thresholds
     """
 
     sensitivity: np.ndarray
     cosine: np.ndarray
     taken: list[int | None]
+    settings: ScreeningSettings = DEFAULTS.screening
 
     def excited(self, effect: int) -> bool:
         """Whether the data could show this effect."""
-        return bool(self.sensitivity[effect] >= EXCITED)
+        return bool(self.sensitivity[effect] >= self.settings.excited)
 
     def alike(self, effect: int) -> list[int]:
         """The other excited effects of its class."""
-        near = np.flatnonzero(np.abs(self.cosine[effect]) > SAME)
+        near = np.flatnonzero(np.abs(self.cosine[effect]) > self.settings.same)
         return [int(i) for i in near if i != effect and self.excited(int(i))]
 
 
-def screen(problem: Problem, fit: Fit) -> Screening:
+def screen(problem: Problem, fit: Fit, settings: ScreeningSettings = DEFAULTS.screening) -> Screening:
     """Linearise at the null of every candidate.
 
     :param problem: training windows
@@ -70,11 +66,14 @@ def screen(problem: Problem, fit: Fit) -> Screening:
             if len(roots[a]) and len(roots[b]):
                 canonical = np.linalg.svd(roots[a] @ even[np.ix_(groups[a], groups[b])] @ roots[b].T, compute_uv=False)
                 # The smaller group must lie in the larger one.
-                cosine[a, b] = cosine[b, a] = round(float(np.clip(canonical.min(), 0, 1)), DIGITS)
-    return Screening(sensitivity, cosine, _taken(problem, reduced.normal.sum(0), sensitivity))
+                cosine[a, b] = cosine[b, a] = round(float(np.clip(canonical.min(), 0, 1)), settings.digits)
+    taken = _taken(problem, reduced.normal.sum(0), sensitivity, settings)
+    return Screening(sensitivity, cosine, taken, settings)
 
 
-def _taken(problem: Problem, normal: np.ndarray, sensitivity: np.ndarray) -> list[int | None]:
+def _taken(
+    problem: Problem, normal: np.ndarray, sensitivity: np.ndarray, settings: ScreeningSettings
+) -> list[int | None]:
     """Of each effect the known one that does the same, see :class:`Screening`.
 
     :param normal: of all strengths, (f, f)
@@ -84,11 +83,11 @@ def _taken(problem: Problem, normal: np.ndarray, sensitivity: np.ndarray) -> lis
     groups = [np.flatnonzero(np.isin(strength, np.arange(s.start, s.stop))) for s in simulation.slices]
     known = [e for e, effect in enumerate(simulation.effects) if effect.known]
     size = np.sqrt(np.maximum(np.diag(normal), 1e-12))
-    likeness = np.abs(normal / size / size[:, None]).round(DIGITS)
+    likeness = np.abs(normal / size / size[:, None]).round(settings.digits)
     taken: list[int | None] = []
     for e, g in enumerate(groups):
         alone = np.sqrt(max(0.0, float(np.linalg.eigvalsh(normal[np.ix_(g, g)])[-1]))) if len(g) else 0.0
-        hidden = e not in known and known and sensitivity[e] < EXCITED <= alone
+        hidden = e not in known and known and sensitivity[e] < settings.excited <= alone
         taken.append(max(known, key=lambda d: float(likeness[np.ix_(groups[d], g)].max())) if hidden else None)
     return taken
 

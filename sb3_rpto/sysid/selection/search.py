@@ -11,49 +11,14 @@ from sb3_rpto.effects import Effect, Simulation
 from sb3_rpto.fitting.loss import FAR
 from sb3_rpto.sysid.problem.problem import IdentificationProblem, Progress, silent
 from sb3_rpto.sysid.selection.adequacy import SETTLED, Adequacy, adequacy, counted_with, judge
-from sb3_rpto.sysid.selection.model_comparison import GAIN, MISSED, NOTHING, Evidence, compare
-from sb3_rpto.sysid.selection.model_comparison import SEVERAL as RARE_BLOCKS
+from sb3_rpto.sysid.selection.model_comparison import Evidence, compare
 from sb3_rpto.sysid.selection.screening import Screening, screen
-from sb3_rpto.sysid.selection.stepwise_selection import (
-    INSTEAD,
-    JOINT,
-    REFIT,
-    SEEMS,
-    TENTH,
-    THRESHOLD,
-    Model,
-    Selection,
-    Selector,
-)
+from sb3_rpto.sysid.selection.stepwise_selection import Model, Selection, Selector
 from sb3_rpto.sysid.selection.substitution import Substitution
 from sb3_rpto.sysid.selection.threshold_calibration import calibrate_threshold
+from sb3_rpto.sysid.settings import Settings
 from sb3_rpto.sysid.shooting.multiple_shooting import START_STEPS, Fit, Problem
 from sb3_rpto.sysid.shooting.trimmed_refinement import fit_trimmed, refine
-
-#: Declared parameters are fitted from so many starts.
-STARTS = 3
-#: Fewer windows than these hardly show that one stretch of motion is not accounted for.
-FEW = 10
-#: So many effects that meet exact data may be in the place of fewer.
-SEVERAL = 3
-#: Finer steps in time are taken where they lower R by this share: then the steps, not the model, make it.
-FINER = 0.03
-#: A simulator's steps, so many to one of the model's, are tried where R is no more than the limit, with so few
-#: iterations of the fit; they are taken where they lower the windows' errors by this share.
-SUBSTEPS, SUBSTEPS_LIMIT, SUBSTEPS_FIT, SUBSTEPS_GAIN = (1, 2, 4), 3.0, 5, 0.05
-
-#: So many of the nearest are led on: dry friction may lie behind what holds it and more, and what gives way.
-GROUPS_NEAREST = 4
-#: Most kinds that account for exact data together.
-GROUPS_MOST = 3
-#: A further one is looked for where the nearest lowers the cost to less than this share.
-GROUPS_FURTHER = 0.8
-#: Beside the simplest whose cost is not so many times the lowest one.
-GROUPS_LIKE = 2.0
-#: Most of the missed windows that rank_starts are compared in.
-LIMITS_WINDOWS = 20
-#: A soft stop gives way: it may lie so many plausible sizes inside of where the motion ended.
-LIMITS_INSIDE = (0.0, 0.2, 0.5, 1.0, 2.0)
 
 
 @dataclass(frozen=True)
@@ -70,20 +35,21 @@ class SelectorPair:
     say: Progress = silent
 
     @classmethod
-    def on(cls, problem: IdentificationProblem, horizon: float, threshold: float = THRESHOLD) -> SelectorPair:
+    def on(cls, problem: IdentificationProblem, horizon: float, settings: Settings | None = None) -> SelectorPair:
         """Selectors for a problem.
 
         :param problem: what is to be explained
         :param horizon: length of the windows in s
-        :param threshold: t*, see :class:`Selector`
+        :param settings: thresholds; default: the problem's
         """
 
         def select(simulation: Simulation) -> Selector:
             train, judging = problem.windows(simulation, horizon)
             parts = Problem(simulation, train, problem.scales), judging and Problem(simulation, judging, problem.scales)
-            return Selector(*parts, threshold, lambda share, what: say(0.2 + 0.5 * share, what), horizon)
+            return Selector(*parts, lambda share, what: say(0.2 + 0.5 * share, what), horizon, thresholds)
 
-        say, fine = problem.inputs.say, select(problem.fine)
+        say, thresholds = problem.inputs.say, settings or problem.settings
+        fine = select(problem.fine)
         return cls(fine, fine if problem.rough is problem.fine else select(problem.rough), say)
 
     @property
@@ -92,9 +58,14 @@ class SelectorPair:
         return self.fine.horizon
 
     @property
-    def threshold(self) -> float:
-        """t* of both."""
-        return self.fine.threshold
+    def settings(self) -> Settings:
+        """Thresholds of both."""
+        return self.fine.settings
+
+    def change_threshold(self, threshold: float) -> None:
+        """Let both select by another t*; what they have fitted stays."""
+        selection = replace(self.settings.selection, threshold=threshold)
+        self.fine.settings = self.rough.settings = replace(self.settings, selection=selection)
 
 
 @dataclass(frozen=True)
@@ -164,16 +135,16 @@ def search(problem: IdentificationProblem) -> SearchResult:
         return SearchResult(on, base, before, None, Selection(base), before, substeps)
     on = correct_for_discretisation(on, base.fit.values)
     on.say(0.15, "screening the candidates")
-    screening = screen(on.fine.train, nominal_at_bounds(on.fine.train, base.fit))
+    screening = screen(on.fine.train, nominal_at_bounds(on.fine.train, base.fit), on.settings.screening)
     if calibrate:
         on.say(0.2, f"calibrating on {calibrate} complete sets")
         alone = on.rough.fit_model((), base.fit).fit
         t = calibrate_threshold(on.rough, alone, joint_candidates(on.fine, screening), calibrate, seed)
-        on.fine.threshold = on.rough.threshold = t
+        on.change_threshold(t)
     selection = select_effects(on, base, screening, seed)
     if problem.longer is not None and on.fine.model_error_dominates(selection.model):
         on.say(0.75, "looking at longer windows")
-        then = SelectorPair.on(problem, problem.longer, on.threshold)
+        then = SelectorPair.on(problem, problem.longer, on.settings)
         more = continue_search(then, selection, screening)
         if more.model.effects:
             on, selection = then, more
@@ -200,7 +171,7 @@ def _search_joint_limits(
     if not selection.model.effects:
         substeps = simulator_substeps(problem, on, base, before)
         return SearchResult(on, base, before, None, selection, before, substeps)
-    screening = screen(on.fine.train, nominal_at_bounds(on.fine.train, base.fit))
+    screening = screen(on.fine.train, nominal_at_bounds(on.fine.train, base.fit), on.settings.screening)
     return SearchResult(on, base, before, screening, selection, assess(on.fine, selection.model, problem.inputs.seed))
 
 
@@ -215,19 +186,20 @@ def simulator_substeps(problem: IdentificationProblem, on: SelectorPair, model: 
     :param model: fitted there
     :param seen: its adequacy
     """
-    if seen.ratio > SUBSTEPS_LIMIT:
+    settings = on.fine.thresholds
+    if seen.ratio > settings.substeps_limit:
         return None
     better = []
-    for substeps in SUBSTEPS:
+    for substeps in settings.substeps:
         stepwise = problem.in_simulator_steps(substeps)
         if stepwise is None:
             return None
         then = SelectorPair.on(stepwise, on.horizon)
         on.say(0.0, "judging in a simulator's own steps")
-        stepped = then.fine.fit_model(model.effects, model.fit, iterations=SUBSTEPS_FIT)
+        stepped = then.fine.fit_model(model.effects, model.fit, iterations=settings.substeps_iterations)
         saved = -float(np.mean(np.log(stepped.fit.errors / model.fit.errors)))
         explains = not seen.adequate and assess(then.fine, stepped, problem.inputs.seed).adequate
-        if explains or saved > -np.log(1 - SUBSTEPS_GAIN):
+        if explains or saved > -np.log(1 - settings.substeps_gain):
             better.append((explains, saved, substeps))
     return max(better)[2] if better else None
 
@@ -256,10 +228,10 @@ def retry_finer_steps(
     finer = problem.in_finer_steps()
     if finer is None:
         return on, model, seen
-    then = SelectorPair.on(finer, on.horizon, on.threshold)
+    then = SelectorPair.on(finer, on.horizon, on.settings)
     # Values that make up for the longer steps would err with the shorter ones.
     look = then.fine.fit_model(model.effects, model.fit, iterations=4)
-    if not assess(then.fine, look, problem.inputs.seed).ratio < (1 - FINER) * seen.ratio:
+    if not assess(then.fine, look, problem.inputs.seed).ratio < (1 - on.fine.thresholds.finer_gain) * seen.ratio:
         return on, model, seen
     model = then.fine.fit_model(model.effects, look.fit, iterations=10)
     return then, model, assess(then.fine, model, problem.inputs.seed)
@@ -288,7 +260,7 @@ def correct_for_discretisation(on: SelectorPair, values: np.ndarray) -> Selector
     old, select = on.rough, None
     if old.select is not None and on.fine.select is not None:
         select = less(old.select, on.fine.select)
-    rough_selector = Selector(less(old.train, on.fine.train), select, old.threshold, old.say, old.horizon)
+    rough_selector = Selector(less(old.train, on.fine.train), select, old.say, old.horizon, old.settings)
     return replace(on, rough=rough_selector)
 
 
@@ -302,14 +274,14 @@ def fit_declared(selector: Selector, seed: int) -> Fit:
     if not len(free):
         return best
     rng = np.random.default_rng(seed)
-    for _ in range(STARTS - 1):
+    for _ in range(selector.thresholds.starts - 1):
         start = begin.copy()
         step = rng.uniform(-3, 3, len(free)) * problem.size[free]
         start[free] = np.clip(begin[free] + step, problem.lower[free] + margin, problem.upper[free] - margin)
         other = problem.fit(start, free, iterations=20)
         if other.cost < 0.999 * best.cost:
             best = other
-    return refine(problem, best, free)
+    return refine(problem, best, free, selector.settings.refinement)
 
 
 def joint_candidates(selector: Selector, screening: Screening) -> list[int]:
@@ -371,18 +343,18 @@ def select_effects(on: SelectorPair, base: Model, screening: Screening, seed: in
         on = correct_for_discretisation(on, first.model.fit.values)
         rough, begin = on.rough, first.model
         alone, first.model = rough.fit_model((), base.fit), rough.fit_model(begin.effects, begin.fit)
-    if (
-        rough.fits_exactly(first.model) or rough.predicted_gain(first.model, chosen) < GAIN
-    ):  # all together could not be clear
+    # All together could not be clear.
+    if rough.fits_exactly(first.model) or rough.predicted_gain(first.model, chosen) < rough.least_gain:
         return finalise(on, first, screening)
     on.say(0.3, f"fitting {len(chosen)} candidates together")
     begins = [model for model in rough.fit_together(chosen, alone.fit, first.model.fit) if model is not None]
-    nearer = [m for m in begins if not rough.model_error_dominates(m) or rough.evidence(m, alone).clear(SEEMS)]
-    nearer = [m for m in nearer if not rough.evidence(first.model, m).clear(SEEMS)]
+    seems = on.fine.thresholds.seems
+    nearer = [m for m in begins if not rough.model_error_dominates(m) or rough.evidence(m, alone).clear(seems)]
+    nearer = [m for m in nearer if not rough.evidence(first.model, m).clear(seems)]
     if nearer:  # what seems to matter stays while much else may still be wrong
-        selection = rough.add_effects(rough.eliminate(Selection(nearer[0]), SEEMS), looked_at)
+        selection = rough.add_effects(rough.eliminate(Selection(nearer[0]), seems), looked_at)
     else:
-        selection = rough.add_effects(first, looked_at, INSTEAD, screening.alike)
+        selection = rough.add_effects(first, looked_at, on.fine.thresholds.rounds_instead, screening.alike)
     return finalise(on, selection, screening)
 
 
@@ -428,7 +400,7 @@ def prefer_fewest(selector: Selector, selection: Selection, candidates: Sequence
     What two or three effects meet, one may meet in their place, or in the place of all but one of them.
     """
     model = selection.model
-    if not selector.fits_exactly(model) or not 1 < len(model.effects) <= SEVERAL:
+    if not selector.fits_exactly(model) or not 1 < len(model.effects) <= selector.thresholds.several:
         return selection
     keeping: list[list[int]] = [[], *([e] for e in model.effects if len(model.effects) > 2)]
     for rest in keeping:
@@ -444,12 +416,17 @@ def assess(selector: Selector, model: Model, seed: int) -> Adequacy:
     What a robust fit gives up of the windows that it was made to counts, too: the runs to judge on may be few, or move
     as none of the others did. Where they show enough by themselves, one odd run among those fitted is only told.
     """
-    seen = adequacy(selector.judging, selector.judging.score(model.fit.values, iterations=START_STEPS), seed)
+    settings, values = selector.settings, model.fit.values
+    seen = adequacy(selector.judging, selector.judging.score(values, iterations=START_STEPS), seed, settings.adequacy)
     if selector.select is None:
         return seen
     count, train = len(selector.select.windows), selector.train
-    fitted = adequacy(train, train.score(model.fit.values, iterations=START_STEPS), seed)
-    return counted_with(seen, count, fitted, len(train.windows)) if count < FEW or fitted.spread else seen
+    fitted = adequacy(train, train.score(values, iterations=START_STEPS), seed, settings.adequacy)
+    return (
+        counted_with(seen, count, fitted, len(train.windows))
+        if count < settings.selection.few_windows or fitted.spread
+        else seen
+    )
 
 
 # --- a few kinds, each at all its places ------------------------------------------------------------------------------
@@ -466,29 +443,33 @@ def select_groups(selector: Selector, screening: Screening, base: Fit) -> Model 
     :param base: those
     """
     train, effects = selector.train, selector.simulation.effects
-    chosen, fit = list[int](), base
-    for turn in range(GROUPS_MOST if train.exact else 1):
-        screening = screen(train, fit) if turn else screening
+    settings, chosen, fit = selector.thresholds, list[int](), base
+    for turn in range(settings.kinds_together if train.exact else 1):
+        screening = screen(train, fit, selector.settings.screening) if turn else screening
         shown = [i for i, e in enumerate(effects) if not e.known and screening.excited(i) and i not in chosen]
         fits = []
         for (kind, _), places in selector.group_by_kind(shown, apart=True).items():
             selector.say(0.0, f"{kind} at all places")
             together = [*chosen, *places]
-            fits.append((together, train.fit(fit.values, selector.free(together), fit.starts, JOINT)))
-        nearest = sorted(fits, key=lambda found: found[1].cost)[:GROUPS_NEAREST]
+            fits.append(
+                (together, train.fit(fit.values, selector.free(together), fit.starts, settings.joint_iterations))
+            )
+        nearest = sorted(fits, key=lambda found: found[1].cost)[: settings.kinds_refined]
         led = []
         for together, begun in sorted(nearest, key=lambda found: len(selector.free(found[0]))):
-            begun = fit_trimmed(train, begun, selector.free(together))
-            if np.median(begun.errors) < max(FAR, TENTH * np.median(base.errors)):  # else kinks are not all it lacks
+            begun = fit_trimmed(train, begun, selector.free(together), selector.settings.refinement)
+            if np.median(begun.errors) < max(
+                FAR, settings.gain_far * np.median(base.errors)
+            ):  # else kinks are not all it lacks
                 model = selector.refine(selector.fit_model(together, begun))
                 if selector.fits_exactly(model) if train.exact else not selector.model_error_dominates(model):
                     return model
             led.append((together, begun))
         lowest = min([begun.cost for _, begun in led], default=np.inf)
-        if not lowest < GROUPS_FURTHER * fit.cost:
+        if not lowest < settings.kinds_further * fit.cost:
             return None
         # What has many parameters takes up much of whatever is missing.
-        near = [found for found in led if found[1].cost < min(GROUPS_LIKE * lowest, fit.cost)]
+        near = [found for found in led if found[1].cost < min(settings.kinds_alike * lowest, fit.cost)]
         chosen, fit = min(near, key=lambda found: len(selector.free(found[0])))
     return None
 
@@ -516,27 +497,36 @@ def add_joint_limits(selector: Selector, selection: Selection) -> Selection:
 
 def _one_more(selector: Selector, model: Model) -> Model | None:
     """The model with the stop that accounts for most of the windows that it misses; None where none does for some."""
-    problem, simulation = selector.train, selector.simulation
-    missed = np.flatnonzero(model.fit.errors > MISSED)
-    if len(np.unique(problem.windows.block[missed])) < RARE_BLOCKS:
+    problem, simulation, settings = selector.train, selector.simulation, selector.thresholds
+    limit = selector.settings.comparison.missed
+    missed = np.flatnonzero(model.fit.errors > limit)
+    if len(np.unique(problem.windows.block[missed])) < selector.settings.comparison.rare_blocks:
         return None
-    some = missed[np.linspace(0, len(missed) - 1, min(LIMITS_WINDOWS, len(missed))).round().astype(int)]
+
+    def typical(errors: np.ndarray) -> float:
+        return float(np.exp(np.log(np.maximum(errors, selector.settings.comparison.error_floor)).mean()))
+
+    some = missed[np.linspace(0, len(missed) - 1, min(settings.limit_windows, len(missed))).round().astype(int)]
     part, starts, tried = problem.on(some), model.fit.starts[some], []
     for e, effect in enumerate(simulation.effects):
         if effect.kind == "end_stop" and not effect.known:
-            for stop, begins in _beginnings(problem, model.fit.values, e):
-                begin = min(begins, key=lambda values: _typical(part.score(values, starts).errors))
-                fit = part.fit(begin, np.array([stop]), starts, REFIT)
-                tried.append((_typical(fit.errors), e, fit.values))
+            for stop, begins in _beginnings(problem, model.fit.values, e, settings.limit_inside):
+                begin = min(begins, key=lambda values: typical(part.score(values, starts).errors))
+                fit = part.fit(begin, np.array([stop]), starts, settings.refit_iterations)
+                tried.append((typical(fit.errors), e, fit.values))
     error, e, values = min(tried, key=lambda one: one[0], default=(np.inf, 0, model.fit.values))
-    if error > (1 - TENTH) * _typical(model.fit.errors[some]):
+    if error > (1 - settings.gain_far) * typical(model.fit.errors[some]):
         return None
-    trial = selector.fit_model_from([*{*model.effects, e}], replace(model.fit, values=values, linear=None), JOINT)
+    trial = selector.fit_model_from(
+        [*{*model.effects, e}], replace(model.fit, values=values, linear=None), settings.joint_iterations
+    )
     trial = selector.refine(trial)
-    return trial if np.sum(trial.fit.errors > MISSED) < len(missed) else None
+    return trial if np.sum(trial.fit.errors > limit) < len(missed) else None
 
 
-def _beginnings(problem: Problem, values: np.ndarray, effect: int) -> Iterator[tuple[int, list[np.ndarray]]]:
+def _beginnings(
+    problem: Problem, values: np.ndarray, effect: int, inside: Sequence[float]
+) -> Iterator[tuple[int, list[np.ndarray]]]:
     """The index of each of a joint's stops, and the values with it about that end of what the joint was seen to do."""
     w, simulation = problem.windows, problem.simulation
     joint = simulation.effects[effect].index
@@ -544,7 +534,7 @@ def _beginnings(problem: Problem, values: np.ndarray, effect: int) -> Iterator[t
         seen = w.measured[:, :, column][w.usable]
         for side, end in enumerate((seen.min(), seen.max())):
             stop = simulation.slices[effect].start + side
-            inwards = np.array(LIMITS_INSIDE) * problem.size[stop] * (1 - 2 * side)
+            inwards = np.array(inside) * problem.size[stop] * (1 - 2 * side)
             moved = end + inwards - simulation.model.jnt_range[joint, side]
             yield stop, [np.r_[values[:stop], m, values[stop + 1 :]] for m in moved]
 
@@ -554,7 +544,7 @@ def _needed(selector: Selector, selection: Selection) -> Selection:
     model, evidence = selection.model, dict[int, Evidence]()
     for e in model.effects:
         without = selector.fit_model([i for i in model.effects if i != e], model.fit)
-        evidence[e] = compare(without.errors, model.errors, selector.blocks, rare=True)
+        evidence[e] = compare(without.errors, model.errors, selector.blocks, True, selector.settings.comparison)
         # What meets exact data in every window needs no more blocks to speak for it.
         met = selector.fits_exactly(model) and not selector.fits_exactly(without)
         if not met and not evidence[e].clear(*selector.limit(model)):
@@ -562,7 +552,3 @@ def _needed(selector: Selector, selection: Selection) -> Selection:
             return _needed(selector, replace(selection, model=without, dropped=dropped))
     alike = {e: others for e, others in selection.alike.items() if e in model.effects}
     return replace(selection, alike=alike, evidence=evidence)
-
-
-def _typical(errors: np.ndarray) -> float:
-    return float(np.exp(np.log(np.maximum(errors, NOTHING)).mean()))

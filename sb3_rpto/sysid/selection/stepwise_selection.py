@@ -10,39 +10,11 @@ import numpy as np
 
 from sb3_rpto.fitting.loss import FAR, Loss
 from sb3_rpto.sysid.problem.problem import Progress, silent
-from sb3_rpto.sysid.selection.model_comparison import GAIN, Evidence, compare, folds, several_missed, unseen_errors
-from sb3_rpto.sysid.shooting import trimmed_refinement
+from sb3_rpto.sysid.selection.model_comparison import Evidence, compare, folds, several_missed, unseen_errors
+from sb3_rpto.sysid.settings import DEFAULTS, SelectionSettings, Settings
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Linear, Problem
 from sb3_rpto.sysid.shooting.trimmed_refinement import refine
 from sb3_rpto.sysid.shooting.windows import join
-
-#: t*, well above what complete sets need to have nothing named (`benchmark threshold`: at most 2.0 in 30, most 0), as
-#: real noise is not theirs; `calibrate` measures it for the data at hand.
-THRESHOLD = 3.5
-#: A model of exact data that typically errs by less may only be held by kinks.
-NEARLY = 10.0
-#: t* there: what else lacks, not the noise, spreads the blocks, and the 98 % quantile of one test is the best there is.
-LIKELY = 2.0
-#: Share of the error that counts there: of the many effects that would fit a little of what lacks, few are named.
-TENTH = 0.1
-#: Iterations of a refit that begins at the larger model's optimum.
-REFIT = 5
-#: Iterations of the joint fit of all candidates.
-JOINT = 15
-#: Effects whose removal raises the cost by less than this share, to second order, may go together.
-TRIFLE = 0.01
-#: So many of the cheapest effects are tried to be dropped one by one.
-TRIED = 3
-#: t from which on an effect seems to matter.
-SEEMS = 1.5
-#: Rounds of the look forward, after a joint fit and in its place; candidates of each that are fitted to some windows
-#: and to all.
-ROUNDS, INSTEAD, QUICK, PROMISING = 3, 8, 10, 4
-#: Typical window error, in units of the noise, that leaves nothing to look forward to.
-ENOUGH = 1.1
-
-#: So many starts of an effect are fitted: those that promise most.
-STARTS_TRIED = 3
 
 
 @dataclass(frozen=True)
@@ -81,27 +53,31 @@ class Selector:
 
     :param train: windows to fit
     :param select: windows of runs set apart; None where there are none
-    :param threshold: t*, see :func:`sb3_rpto.sysid.trace.trace`
     :param say: progress: the share of the search that is done, and what is being done
     :param horizon: length of the windows in s, for the gap between folds
+    :param settings: thresholds
     """
 
     def __init__(
         self,
         train: Problem,
         select: Problem | None = None,
-        threshold: float = THRESHOLD,
         say: Progress = silent,
         horizon: float = 0.0,
+        settings: Settings = DEFAULTS,
     ) -> None:
-        self.train, self.select, self.threshold, self.say = train, select, threshold, say
-        self.horizon = horizon
-        self.folds = folds(train.windows, horizon)
+        self.train, self.select, self.say, self.horizon, self.settings = train, select, say, horizon, settings
+        self.folds = folds(train.windows, horizon, settings.comparison.folds)
         self.blocks = np.concatenate([train.windows.block[b] for _, b in self.folds])
         if select:
             self.blocks = np.concatenate([self.blocks, select.windows.block + self.blocks.max() + 1])
         self.simulation = train.simulation
         self._memory: dict[tuple[int, ...], Model] = {}
+
+    @property
+    def thresholds(self) -> SelectionSettings:
+        """Those of the selection."""
+        return self.settings.selection
 
     @property
     def judging(self) -> Problem:
@@ -136,10 +112,13 @@ class Selector:
         :return: the model of all, and that of the best few kinds where it was needed
         """
         free = self.free(effects)
-        best, few = self.train.fit(begin.values, free, begin.starts, JOINT, tolerance=3e-3), None
-        if np.median(best.errors) > ENOUGH:
+        best, few = (
+            self.train.fit(begin.values, free, begin.starts, self.thresholds.joint_iterations, tolerance=3e-3),
+            None,
+        )
+        if np.median(best.errors) > self.thresholds.enough:
             few = self._best_few(effects, base)
-            other = self.train.fit(few.fit.values, free, base.starts, JOINT, tolerance=3e-3)
+            other = self.train.fit(few.fit.values, free, base.starts, self.thresholds.joint_iterations, tolerance=3e-3)
             best = min(best, other, key=lambda fit: fit.cost)
         return self.fit_model(effects, best), few
 
@@ -161,22 +140,23 @@ class Selector:
         """
         some = np.arange(0, len(self.train.windows), 3)
         part, chosen = self.train.on(some), list[int]()
-        fit = part.fit(base.values, self.free(()), base.starts[some], REFIT)
-        kinds = self.group_by_kind(effects)
-        for _ in range(min(ROUNDS, len(kinds))):
+        iterations, kinds = self.thresholds.refit_iterations, self.group_by_kind(effects)
+        fit = part.fit(base.values, self.free(()), base.starts[some], iterations)
+        for _ in range(min(self.thresholds.rounds, len(kinds))):
             self.say(0.0, f"another start, with {len(chosen)} of the candidates")
-            fits = {k: part.fit(fit.values, self.free([*chosen, *g]), fit.starts, REFIT) for k, g in kinds.items()}
+            free = {kind: self.free([*chosen, *places]) for kind, places in kinds.items()}
+            fits = {kind: part.fit(fit.values, free[kind], fit.starts, iterations) for kind in kinds}
             best = min(fits, key=lambda k: fits[k].cost)
             chosen += kinds.pop(best)
             fit = fits[best]
-        return self.fit_model(chosen, replace(fit, starts=base.starts), 2 * REFIT)
+        return self.fit_model(chosen, replace(fit, starts=base.starts), 2 * iterations)
 
-    def fit_model(self, effects: Sequence[int], begin: Fit, iterations: int = REFIT) -> Model:
+    def fit_model(self, effects: Sequence[int], begin: Fit, iterations: int | None = None) -> Model:
         """Fit a model from the optimum of another, without the effects that it lacks.
 
         Where it ends worse than a smaller one is known to be, it begins again from that.
         """
-        key = tuple(sorted(effects))
+        key, iterations = tuple(sorted(effects)), iterations or self.thresholds.refit_iterations
         if key in self._memory:
             return self._memory[key]
         free = self.free(key)
@@ -205,7 +185,9 @@ class Selector:
         if not shapes.any():
             return model
         values = np.where(shapes, self.simulation.null, begin.values)
-        return self.fit_model_from(model.effects, replace(begin, values=values, linear=None), REFIT)
+        return self.fit_model_from(
+            model.effects, replace(begin, values=values, linear=None), self.thresholds.refit_iterations
+        )
 
     def _less(self, values: np.ndarray, key: Sequence[int]) -> np.ndarray:
         """Parameters at which all effects but the given and the known ones have no influence."""
@@ -219,7 +201,9 @@ class Selector:
         """A model that errs more than need be, out of kinks that may hold its fit; exact data can be met exactly."""
         if not (self.train.exact or self.train.touching or self.model_error_dominates(model)):
             return model
-        return self._remembered(model.effects, refine(self.train, model.fit, self.free(model.effects)))
+        return self._remembered(
+            model.effects, refine(self.train, model.fit, self.free(model.effects), self.settings.refinement)
+        )
 
     def _remembered(self, effects: tuple[int, ...], fit: Fit) -> Model:
         fit = replace(fit, linear=self.train.linear(fit, self.free(effects)))
@@ -228,13 +212,13 @@ class Selector:
 
     def _errors(self, fit: Fit, effects: Sequence[int]) -> np.ndarray:
         """Errors on windows that the parameters were not fitted to."""
-        errors = unseen_errors(self.train, fit, self.free(effects), self.folds)
+        errors = unseen_errors(self.train, fit, self.free(effects), self.folds, self.settings.comparison.prior)
         apart = [self.select.score(fit.values).errors] if self.select else []
         return np.concatenate([*(errors[judged] for _, judged in self.folds), *apart])
 
     def evidence(self, with_: Model, without: Model) -> Evidence:
         """What ``with_`` gains over ``without`` on windows that neither was fitted to."""
-        return compare(without.errors, with_.errors, self.blocks, rare=not self.train.exact)
+        return compare(without.errors, with_.errors, self.blocks, not self.train.exact, self.settings.comparison)
 
     def model_error_dominates(self, model: Model) -> bool:
         """Whether what a model lacks, and not the noise, makes its errors."""
@@ -242,15 +226,22 @@ class Selector:
 
     def fits_exactly(self, model: Model) -> bool:
         """Whether a model meets exact data in every window, as only what is right does."""
-        return self.train.exact and bool(model.fit.errors.max() < trimmed_refinement.ENOUGH)
+        return self.train.exact and bool(model.fit.errors.max() < self.settings.refinement.enough)
 
     def nearly_fits_exactly(self, model: Model) -> bool:
         """Whether exact data may be met by leading a model on."""
-        return self.train.exact and bool(np.median(model.errors) < NEARLY)
+        return self.train.exact and bool(np.median(model.errors) < self.thresholds.nearly_exact)
 
     def limit(self, model: Model) -> tuple[float, float]:
         """The t and the gain that an effect of a model must exceed to stay."""
-        return (min(LIKELY, self.threshold), TENTH) if self.model_error_dominates(model) else (self.threshold, GAIN)
+        s = self.thresholds
+        far = self.model_error_dominates(model)
+        return (min(s.threshold_far, s.threshold), s.gain_far) if far else (s.threshold, self.least_gain)
+
+    @property
+    def least_gain(self) -> float:
+        """Share of the error that an effect must save to stay."""
+        return self.settings.comparison.least_gain
 
     def eliminate(self, outcome: Selection, limit: float | None = None) -> Selection:
         """Drop the effect whose removal costs least until all that remain have a t above the limit.
@@ -264,10 +255,10 @@ class Selector:
         while current.effects:
             step += 1
             order, costs = self.removal_costs(current)
-            trifles = [e for e in order if costs[e] < TRIFLE * current.fit.cost]
+            trifles = [e for e in order if costs[e] < self.thresholds.trifle * current.fit.cost]
             reduced = None
             met = self.fits_exactly(current)
-            bundles = _bundles(order, trifles)
+            bundles = _bundles(order, trifles, self.thresholds.dropped)
             if met:
                 bundles += [kind for kind in self.group_by_kind(order).values() if 1 < len(kind) < len(order)]
             for drop in bundles:
@@ -276,7 +267,7 @@ class Selector:
                     trial = self._unbent(trial, current.fit)
                 evidence = self.evidence(current, trial)
                 self.say(1 - len(trial.effects) / begun, f"{len(current.effects)} effects left, trying without some")
-                if not evidence.clear(*(self.limit(current) if limit is None else (limit, GAIN))):
+                if not evidence.clear(*(self.limit(current) if limit is None else (limit, self.least_gain))):
                     reduced = trial
                     for e in drop:
                         outcome.dropped[e] = (step, evidence)
@@ -309,7 +300,9 @@ class Selector:
             current = selection.model
             selection.evidence = {}
             for e in current.effects:
-                without = self.fit_model([i for i in current.effects if i != e], current.fit, REFIT + 3)
+                without = self.fit_model(
+                    [i for i in current.effects if i != e], current.fit, self.thresholds.refit_iterations + 3
+                )
                 selection.evidence[e] = self.evidence(current, without)
             weak = [e for e, evidence in selection.evidence.items() if not evidence.clear(*self.limit(current))]
             if not weak:
@@ -323,7 +316,7 @@ class Selector:
         self,
         selection: Selection,
         candidates: Sequence[int],
-        rounds: int = ROUNDS,
+        rounds: int | None = None,
         alike: Callable[[int], Sequence[int]] = lambda effect: (),
     ) -> Selection:
         """Add the effects that are clearly needed one by one, as long as much is missing.
@@ -333,12 +326,14 @@ class Selector:
 
         :param selection: begun with
         :param candidates: of each class one
-        :param rounds: most effects to add
+        :param rounds: most effects to add; default: see the settings
         :param alike: the others of the class of an effect
         """
-        for _ in range(rounds):
+        for _ in range(self.thresholds.rounds if rounds is None else rounds):
             current = selection.model
-            if np.median(current.errors) < ENOUGH and not several_missed(current.errors, self.blocks):
+            if np.median(current.errors) < self.thresholds.enough and not several_missed(
+                current.errors, self.blocks, self.settings.comparison
+            ):
                 break
             tried: list[tuple[float, Model, int]] = []
             for e, begin in self.most_promising(current, [c for c in candidates if c not in current.effects]):
@@ -352,7 +347,7 @@ class Selector:
             seen = [added, *current.effects, *(e for _, _, e in tried)]
             for other in [e for e in alike(added) if e not in seen]:
                 trial = self._with(current, other, current.fit)
-                if self.evidence(trial, best).clear(SEEMS):
+                if self.evidence(trial, best).clear(self.thresholds.seems):
                     best, added = trial, other
             selection.model = best
             selection.dropped.pop(added, None)
@@ -362,13 +357,13 @@ class Selector:
         """Of models with their gains and what was added, the simplest that the best does not seem to beat."""
         _, best, added = max(tried, key=lambda found: found[0])
         for _, model, e in sorted(tried, key=lambda found: len(self.simulation.effects[found[2]].parameters)):
-            if not self.evidence(best, model).clear(SEEMS):
+            if not self.evidence(best, model).clear(self.thresholds.seems):
                 return model, e
         return best, added
 
     def _with(self, model: Model, effect: int, begin: Fit) -> Model:
         self.say(0.0, f"looking at {self.simulation.effects[effect].label}")
-        return self.fit_model([*model.effects, effect], begin, JOINT)
+        return self.fit_model([*model.effects, effect], begin, self.thresholds.joint_iterations)
 
     def predicted_gain(self, model: Model, effects: Sequence[int]) -> float:
         """Share of the error that a model would save with all of some effects, if the cost were quadratic."""
@@ -387,12 +382,14 @@ class Selector:
         gains, fits, starts = {}, {}, {}
         for e, begins in self._promised(part, base, model.effects, outside).items():
             free = self.free([*model.effects, e])
-            trials = [(b.values, part.fit(b.values, free, base.starts, REFIT + 1)) for b in begins]
+            trials = [
+                (b.values, part.fit(b.values, free, base.starts, self.thresholds.refit_iterations + 1)) for b in begins
+            ]
             starts[e], fits[e] = min(trials, key=lambda trial: trial[1].cost)
             gained = float(np.mean(np.log(base.errors) - np.log(fits[e].errors)))
             gains[e] = max(gained, 1 - fits[e].cost / base.cost)
-        best = sorted(gains, key=lambda e: -gains[e])[:PROMISING]
-        return [(e, self._begun(model, e, starts[e], fits[e].values)) for e in best if gains[e] > GAIN]
+        best = sorted(gains, key=lambda e: -gains[e])[: self.thresholds.candidates_to_all]
+        return [(e, self._begun(model, e, starts[e], fits[e].values)) for e in best if gains[e] > self.least_gain]
 
     def _begun(self, model: Model, effect: int, start: np.ndarray, fitted: np.ndarray) -> Fit:
         """Where the fit of a model with one more effect begins: at what some windows led to where all err less there.
@@ -421,7 +418,10 @@ class Selector:
             if len(self.free(effects)) >= len(self.free(model.effects)):
                 continue
             self.say(1.0, f"{self.simulation.effects[e].label} in the place of several")
-            fits = [self.train.fit(b.values, self.free(effects), smaller.fit.starts, JOINT) for b in begins]
+            fits = [
+                self.train.fit(b.values, self.free(effects), smaller.fit.starts, self.thresholds.joint_iterations)
+                for b in begins
+            ]
             trial = self._remembered(tuple(effects), min(fits, key=lambda fit: fit.cost))
             if self.nearly_fits_exactly(trial) and not self.fits_exactly(trial):
                 trial = self.refine(trial)
@@ -433,17 +433,17 @@ class Selector:
         self, part: Problem, base: Fit, kept: Sequence[int], outside: Sequence[int]
     ) -> dict[int, list[Start]]:
         """The effects outside that promise most to first order from any of their starts, with the best of those."""
-        begins = rank_starts(part, base, self.free(kept), outside)
+        begins = rank_starts(part, base, self.free(kept), outside, self.thresholds.starts)
         best = sorted(outside, key=lambda e: -begins[e][0].fall)
         sure = sum(begins[e][0].fall == np.inf for e in outside)
-        return {e: begins[e] for e in best[: QUICK + sure]}
+        return {e: begins[e] for e in best[: self.thresholds.candidates_to_some + sure]}
 
 
-def _bundles(order: list[int], trifles: list[int]) -> list[list[int]]:
+def _bundles(order: list[int], trifles: list[int], alone: int) -> list[list[int]]:
     """What to try to drop: those that hardly matter, at most half of all at once, fewer, the cheapest few alone."""
     trifles = trifles[: (len(order) + 1) // 2]
     bundles = [trifles, trifles[: len(trifles) // 2], trifles[: len(trifles) // 4]] if len(trifles) > 1 else []
-    return [b for b in bundles if len(b) > 1] + [[e] for e in order[:TRIED]]
+    return [b for b in bundles if len(b) > 1] + [[e] for e in order[:alone]]
 
 
 # --- where fits may start ---------------------------------------------------------------------------------------------
@@ -463,7 +463,7 @@ class Start:
 
 
 def rank_starts(
-    problem: Problem, base: Fit, free: Sequence[int] | np.ndarray, effects: Sequence[int]
+    problem: Problem, base: Fit, free: Sequence[int] | np.ndarray, effects: Sequence[int], most: int
 ) -> dict[int, list[Start]]:
     """Where the fits of some effects may start: for each effect the few starts that promise most, the best one first.
 
@@ -473,6 +473,7 @@ def rank_starts(
     :param base: fitted without the effects
     :param free: parameters that were free there
     :param effects: their numbers
+    :param most: starts of each effect
     """
     free = np.asarray(free, dtype=int)
     r, jt, jx = problem.linearise(base.values, base.starts, free)
@@ -498,7 +499,7 @@ def rank_starts(
             values = base.values.copy()
             values[s] = own
             begins.append(Start(values, np.inf if limit else fall(values, strengths)))
-        found[effect] = begins if limit else sorted(begins, key=lambda begin: -begin.fall)[:STARTS_TRIED]
+        found[effect] = begins if limit else sorted(begins, key=lambda begin: -begin.fall)[:most]
     return found
 
 

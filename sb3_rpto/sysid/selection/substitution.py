@@ -9,20 +9,10 @@ from itertools import combinations
 
 import numpy as np
 
-from sb3_rpto.sysid.selection.model_comparison import GAIN, compare
+from sb3_rpto.sysid.selection.model_comparison import compare
 from sb3_rpto.sysid.selection.screening import Screening
-from sb3_rpto.sysid.selection.stepwise_selection import REFIT, SEEMS, Model, Selection, Selector
+from sb3_rpto.sysid.selection.stepwise_selection import Model, Selection, Selector
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
-
-#: Iterations of a fit with one effect in the place of another.
-EXCHANGED = REFIT + 3
-#: Pairs of kept effects in whose place one is tried.
-MERGES = 3
-#: Candidates for a substitution are the likest so many, of at least this cosine; of a kind that is nowhere kept, which
-#: could stand in all places, at least the second.
-SUBSTITUTES, LIKE, AKIN = 5, 0.3, 0.6
-#: Of two that meet exact data the one that errs by less than this share is right, if the other errs by so much.
-RIGHT, ERRS = 0.01, 0.1
 
 
 class Substitution:
@@ -33,7 +23,8 @@ class Substitution:
     """
 
     def __init__(self, selector: Selector, screening: Screening) -> None:
-        self.selector, self.screening = selector, screening
+        self.selector, self.screening, self.settings = selector, screening, selector.settings.substitution
+        self.seems = selector.settings.selection.seems
         self.effects = selector.simulation.effects
         self.kinds = [effect.kind for effect in self.effects]
 
@@ -76,14 +67,15 @@ class Substitution:
         current, selector = selection.model, self.selector
         if selector.model_error_dominates(current) or selector.fits_exactly(current):
             return selection
-        pairs = sorted(combinations(current.effects, 2), key=lambda pair: -self.screening.cosine[pair])[:MERGES]
+        most = self.settings.pairs
+        pairs = sorted(combinations(current.effects, 2), key=lambda pair: -self.screening.cosine[pair])[:most]
         for pair in pairs:
             rest = [e for e in current.effects if e not in pair]
             if len(rest) != len(current.effects) - 2:
                 continue
             for one, trial in self._in_place_of_two(current, pair, rest, selection):
                 selector.say(1.0, f"{self.effects[one].label} in the place of two")
-                if not selector.evidence(current, trial).clear(SEEMS):
+                if not selector.evidence(current, trial).clear(self.seems):
                     current = trial
                     selection.alike[one] = [i for i in self.screening.alike(one) if i not in trial.effects]
                     break
@@ -99,11 +91,16 @@ class Substitution:
         """
         stands = [(e, one) for e in pair for one in selection.alike.get(e, []) if one not in model.effects]
         for e, one in sorted(stands, key=lambda stand: len(self.effects[stand[1]].parameters)):
-            yield one, self.selector.fit_model_from([*rest, one], self._exchanged(model, e, one).fit, EXCHANGED)
+            yield (
+                one,
+                self.selector.fit_model_from(
+                    [*rest, one], self._exchanged(model, e, one).fit, self.settings.iterations
+                ),
+            )
         outside = [i for i in range(len(self.effects)) if i not in rest and self.screening.excited(i)]
         outside = [i for i in outside if not self.effects[i].known]
         for one, begin in self.selector.most_promising(self.selector.fit_model(rest, model.fit), outside):
-            yield one, self.selector.fit_model([*rest, one], begin, EXCHANGED)
+            yield one, self.selector.fit_model([*rest, one], begin, self.settings.iterations)
 
     def make_uniform(self, model: Model, selection: Selection) -> Model:
         """Try the kind that is kept most in the place of each odd one that it resembles: joints are built alike.
@@ -117,7 +114,7 @@ class Substitution:
             kind, places = usual[0]
             same = [i for i in self._excited(kind) if i not in model.effects]
             other = max(same, key=lambda i: self.screening.cosine[e, i], default=e)
-            if places < 2 or self.kinds[e] == kind or self.screening.cosine[e, other] < LIKE:
+            if places < 2 or self.kinds[e] == kind or self.screening.cosine[e, other] < self.settings.like:
                 continue
             self.selector.say(1.0, f"{self.effects[other].label}, as elsewhere")
             trial = self.selector.refine(self._exchanged(model, e, other))
@@ -147,7 +144,7 @@ class Substitution:
         values, simulation = self._translated(model, old, new).values, self.selector.simulation
         values[simulation.slices[old]] = simulation.null[simulation.slices[old]]
         free = self.selector.free([*(i for i in model.effects if i != old), new])
-        return problem.fit(values, free, starts, EXCHANGED, tolerance=3e-3)
+        return problem.fit(values, free, starts, self.settings.iterations, tolerance=3e-3)
 
     def find_alike_everywhere(self, selection: Selection) -> Selection:
         """Name kinds that do as well in the place of all of a kind at once, though one of them alone would not.
@@ -160,7 +157,9 @@ class Substitution:
         counts = Counter(self.kinds[e] for e in model.effects)
         for usual in sorted(kind for kind, places in counts.items() if places > 1):
             for kind in sorted({*self.kinds} - {"declared", usual}):
-                swaps = {e: i for e, i in self._swaps(model, kind, AKIN).items() if self.kinds[e] == usual}
+                swaps = {
+                    e: i for e, i in self._swaps(model, kind, self.settings.akin).items() if self.kinds[e] == usual
+                }
                 if len(swaps) < counts[usual] or any(i in selection.alike.get(e, []) for e, i in swaps.items()):
                     continue
                 self.selector.say(1.0, f"{kind} in all places of {usual}")
@@ -177,14 +176,18 @@ class Substitution:
         if self.selector.fits_exactly(model):  # nothing could be better
             return model
         for kind in sorted({*self.kinds} - {"declared"}):
-            swaps = self._swaps(model, kind, LIKE if kind in {self.kinds[e] for e in model.effects} else AKIN)
+            swaps = self._swaps(
+                model,
+                kind,
+                self.settings.like if kind in {self.kinds[e] for e in model.effects} else self.settings.akin,
+            )
             if len(swaps) < 2:
                 continue
             self.selector.say(1.0, f"{kind} in all places")
             trial = self._swapped(model, swaps)
             if self.selector.nearly_fits_exactly(trial):  # where all places change at once, kinks hold the fit
                 trial = self.selector.refine(trial)
-            if self.selector.evidence(trial, model).clear(SEEMS):
+            if self.selector.evidence(trial, model).clear(self.seems):
                 model = trial
         return model
 
@@ -201,7 +204,11 @@ class Substitution:
         slices, begin = self.selector.simulation.slices, replace(model.fit, values=model.fit.values.copy(), linear=None)
         for old, new in swaps.items():
             begin.values[slices[new]] = self._translated(model, old, new).values[slices[new]]
-        return self.selector.fit_model(sorted({swaps.get(e, e) for e in model.effects}), begin, 2 * REFIT)
+        return self.selector.fit_model(
+            sorted({swaps.get(e, e) for e in model.effects}),
+            begin,
+            2 * self.selector.thresholds.refit_iterations,
+        )
 
     def _excited(self, kind: str) -> list[int]:
         """The places of a kind that the data could show."""
@@ -210,9 +217,9 @@ class Substitution:
     def _likest(self, effect: int, kept: Sequence[int]) -> list[int]:
         """What to try in the place of an effect: kinds that are kept elsewhere first, as joints are built alike."""
         kinds, cosine = {self.kinds[i] for i in kept}, self.screening.cosine[effect]
-        near = [i for i in np.argsort(-cosine, kind="stable").tolist() if cosine[i] > LIKE]
+        near = [i for i in np.argsort(-cosine, kind="stable").tolist() if cosine[i] > self.settings.like]
         near = [i for i in near if i != effect and i not in kept and self.screening.excited(i)]
-        return sorted(near, key=lambda i: self.kinds[i] not in kinds)[:SUBSTITUTES]
+        return sorted(near, key=lambda i: self.kinds[i] not in kinds)[: self.settings.candidates]
 
     def _exchanged(self, model: Model, old: int, new: int) -> Model:
         """The model with ``new`` in the place of ``old``, fitted.
@@ -221,11 +228,13 @@ class Substitution:
         the likest to first order is far from what is.
         """
         effects = [*(i for i in model.effects if i != old), new]
-        found = self.selector.fit_model(effects, self._translated(model, old, new), EXCHANGED)
+        found = self.selector.fit_model(effects, self._translated(model, old, new), self.settings.iterations)
         if self._twins(old, new) and found.fit.cost > model.fit.cost:
             slices, values = self.selector.simulation.slices, model.fit.values.copy()
             values[slices[new]] = values[slices[old]]
-            return self.selector.fit_model_from(effects, replace(model.fit, values=values, linear=None), EXCHANGED)
+            return self.selector.fit_model_from(
+                effects, replace(model.fit, values=values, linear=None), self.settings.iterations
+            )
         return found
 
     def _twins(self, a: int, b: int) -> bool:
@@ -238,7 +247,9 @@ class Substitution:
         What windows err by that were not fitted is known to first order, and at a kink by less than tells twins apart.
         """
         train = self.selector.train
-        gained = compare(twin.fit.errors, model.fit.errors, train.windows.block, rare=not train.exact)
+        gained = compare(
+            twin.fit.errors, model.fit.errors, train.windows.block, not train.exact, self.selector.settings.comparison
+        )
         return gained.clear(*self.selector.limit(model))
 
     def _translated(self, model: Model, old: int, new: int) -> Fit:
@@ -259,10 +270,15 @@ class Substitution:
 
         Where the other meets exact data, one that is far nearer still is right, though no window denies the other.
         """
-        if self.selector.fits_exactly(b) and ERRS < b.fit.errors.max() > a.fit.errors.max() / RIGHT:
+        if (
+            self.selector.fits_exactly(b)
+            and self.settings.errs < b.fit.errors.max() > a.fit.errors.max() / self.settings.right
+        ):
             return True
         far = self.selector.model_error_dominates(a)
-        return self.selector.evidence(a, b).clear(*(self.selector.limit(a) if far else (SEEMS, GAIN)))
+        return self.selector.evidence(a, b).clear(
+            *(self.selector.limit(a) if far else (self.seems, self.selector.least_gain))
+        )
 
     def _simpler(self, a: int, b: int) -> bool:
         return len(self.effects[a].parameters) < len(self.effects[b].parameters)

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_rpto.sysid.selection.stepwise_selection import LIKELY, TRIED, Selection, Selector
+from sb3_rpto.sysid.selection.stepwise_selection import Selection, Selector
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit
-
-#: t* is this quantile of the thresholds that complete sets need.
-LEVEL = 0.95
 
 
 def calibrate_threshold(selector: Selector, base: Fit, chosen: list[int], sets: int, seed: int) -> float:
@@ -23,9 +20,9 @@ def calibrate_threshold(selector: Selector, base: Fit, chosen: list[int], sets: 
     :param sets: number of sets; 20 leave one above the threshold
     :param seed: of the noise
     """
-    return max(
-        LIKELY, float(np.quantile([threshold_of_set(selector, base, chosen, seed + i) for i in range(sets)], LEVEL))
-    )
+    thresholds = [threshold_of_set(selector, base, chosen, seed + i) for i in range(sets)]
+    settings = selector.thresholds
+    return max(settings.threshold_far, float(np.quantile(thresholds, settings.calibration_level)))
 
 
 def threshold_of_set(selector: Selector, base: Fit, chosen: list[int], seed: int) -> float:
@@ -33,7 +30,7 @@ def threshold_of_set(selector: Selector, base: Fit, chosen: list[int], seed: int
     rng = np.random.default_rng(seed)
     train = selector.train.redrawn(base, rng)
     select = None if selector.select is None else selector.select.redrawn(selector.select.score(base.values), rng)
-    return least_threshold(Selector(train, select, selector.threshold, selector.say, selector.horizon), base, chosen)
+    return least_threshold(Selector(train, select, selector.say, selector.horizon, selector.settings), base, chosen)
 
 
 def least_threshold(selector: Selector, base: Fit, chosen: list[int]) -> float:
@@ -50,7 +47,10 @@ def least_threshold(selector: Selector, base: Fit, chosen: list[int]) -> float:
     outcome, level = selector.eliminate(Selection(joint), 0.0), 0.0
     while outcome.model.effects:
         current = outcome.model
-        rests = [[i for i in current.effects if i != e] for e in selector.removal_costs(current)[0][:TRIED]]
+        rests = [
+            [i for i in current.effects if i != e]
+            for e in selector.removal_costs(current)[0][: selector.settings.selection.dropped]
+        ]
         level = min(selector.evidence(current, selector.fit_model(rest, current.fit)).t for rest in rests)
         outcome = selector.eliminate(outcome, level)
     return level

@@ -135,7 +135,7 @@ def start_state(
     """
     qpos, (qvel, qacc), spread = model.qpos0.copy(), np.zeros((2, model.nv)), np.zeros(2 * model.nv)
     if data.whole_states:
-        dofs = velocity_addresses(model, data)
+        dofs = velocity_addresses(model, data.columns)
         qpos[addresses] = episode.qpos[index]
         qvel[dofs] = episode.qvel[index]
         if index + 1 < len(episode):

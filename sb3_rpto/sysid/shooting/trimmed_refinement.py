@@ -4,29 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from sb3_rpto.sysid.settings import DEFAULTS, RefinementSettings
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
 
-#: Shares of the windows that are fitted alone, in their turn: the next one when the last did not pay.
-SHARES = (0.5, 0.75, 0.25)
-#: A step pays when it lowers the cost to this share; at most so many are taken.
-WORTH, STEPS = 0.9, 30
-#: Largest window error, in units of the noise, that leaves nothing to look for.
-ENOUGH = 2.0
-#: Iterations of a fit to a share and of one to all.
-ITERATIONS = 10
-#: Windows are lengthened from so many samples on.
-FIRST = 2
-#: Fits begin anew beside the best one until so many in a row did not pay.
-HOPS = 3
-#: Measured data's only where the typical window errs by less than so many units of the noise.
-NEAR = 3.0
-#: How far beside it, in plausible sizes: by powers of ten between these.
-FAR_AND_NEAR = (-2.0, 0.0)
 #: A parameter shows in nothing where its curvature is this share of the largest.
 NOTHING = 1e-12
 
 
-def refine(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
+def refine(problem: Problem, fit: Fit, free: np.ndarray, settings: RefinementSettings = DEFAULTS.refinement) -> Fit:
     """Lengthen and concentrate a fit; where it may still err, begin anew beside the best.
 
     The last is basin hopping (Wales and Doye 1997): for exact data until they are met, and where contacts come and go
@@ -38,20 +23,26 @@ def refine(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     :param free: indices of the parameters that may move, (f,)
     :return: never of a higher cost than ``fit``
     """
-    fit, failed, rng = fit_trimmed(problem, fit_lengthening(problem, fit, free), free), 0, np.random.default_rng(0)
-    near = problem.touching and np.median(fit.errors) < NEAR
-    hops = HOPS if len(free) and (problem.exact or near) else 0
-    while failed < hops and fit.errors.max() > ENOUGH:
-        hop = 10 ** rng.uniform(*FAR_AND_NEAR) * rng.standard_normal(len(free))
+    fit, failed, rng = (
+        fit_trimmed(problem, fit_lengthening(problem, fit, free, settings), free, settings),
+        0,
+        np.random.default_rng(0),
+    )
+    near = problem.touching and np.median(fit.errors) < settings.hop_error
+    hops = settings.hops if len(free) and (problem.exact or near) else 0
+    while failed < hops and fit.errors.max() > settings.enough:
+        hop = 10 ** rng.uniform(*settings.hop_powers) * rng.standard_normal(len(free))
         beside = fit.values.copy()
         beside[free] = np.clip(beside[free] + hop * problem.size[free], problem.lower[free], problem.upper[free])
-        trial = fit_trimmed(problem, problem.fit(beside, free, iterations=2 * ITERATIONS), free)
-        failed = 0 if trial.cost < WORTH * fit.cost else failed + 1
+        trial = fit_trimmed(problem, problem.fit(beside, free, iterations=2 * settings.iterations), free, settings)
+        failed = 0 if trial.cost < settings.worth * fit.cost else failed + 1
         fit = min(fit, trial, key=lambda f: f.cost)
     return fit
 
 
-def fit_lengthening(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
+def fit_lengthening(
+    problem: Problem, fit: Fit, free: np.ndarray, settings: RefinementSettings = DEFAULTS.refinement
+) -> Fit:
     """Fit the first samples of exact windows, then twice as many, and so on up to whole ones.
 
     Over a few samples a motion is nearly linear in the parameters, over long windows it may be chaotic: progressive
@@ -62,16 +53,18 @@ def fit_lengthening(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     :param free: indices of the parameters that may move, (f,)
     :return: never of a higher cost than ``fit``
     """
-    if not (problem.exact and len(free) and fit.errors.max() > ENOUGH):
+    if not (problem.exact and len(free) and fit.errors.max() > settings.enough):
         return fit
-    values, samples = fit.values, FIRST
+    values, samples = fit.values, settings.first_samples
     while samples < problem.windows.usable.shape[1]:
-        values = problem.first(samples).fit(values, free, fit.starts, 2 * ITERATIONS).values
+        values = problem.first(samples).fit(values, free, fit.starts, 2 * settings.iterations).values
         samples *= 2
-    return min(fit, problem.fit(values, free, fit.starts, ITERATIONS), key=lambda f: f.cost)
+    return min(fit, problem.fit(values, free, fit.starts, settings.iterations), key=lambda f: f.cost)
 
 
-def fit_trimmed(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
+def fit_trimmed(
+    problem: Problem, fit: Fit, free: np.ndarray, settings: RefinementSettings = DEFAULTS.refinement
+) -> Fit:
     """Fit the windows that a fit predicts best, then all of them again, and so on while that pays.
 
     A window in which a contact opens or a joint comes to rest has a kinked error, and many of them hold a descent
@@ -84,19 +77,19 @@ def fit_trimmed(problem: Problem, fit: Fit, free: np.ndarray) -> Fit:
     :return: never of a higher cost than ``fit``
     """
     turn, failed = 0, 0
-    for _ in range(STEPS if len(free) else 0):
-        if failed == len(SHARES) or fit.errors.max() <= ENOUGH:
+    for _ in range(settings.steps if len(free) else 0):
+        if failed == len(settings.shares) or fit.errors.max() <= settings.enough:
             break
-        count = max(1, round(SHARES[turn] * len(fit.errors)))
+        count = max(1, round(settings.shares[turn] * len(fit.errors)))
         nearest = np.sort(np.argsort(fit.errors)[:count])
-        some = problem.on(nearest).fit(_shown(problem, fit, free), free, fit.starts[nearest], ITERATIONS)
+        some = problem.on(nearest).fit(_shown(problem, fit, free), free, fit.starts[nearest], settings.iterations)
         starts = fit.starts.copy()
         starts[nearest] = some.starts
-        trial = problem.fit(some.values, free, starts, ITERATIONS)
-        if trial.cost < WORTH * fit.cost:
+        trial = problem.fit(some.values, free, starts, settings.iterations)
+        if trial.cost < settings.worth * fit.cost:
             failed = 0
         else:
-            turn, failed = (turn + 1) % len(SHARES), failed + 1
+            turn, failed = (turn + 1) % len(settings.shares), failed + 1
         fit = min(fit, trial, key=lambda f: f.cost)
     return fit
 

@@ -18,6 +18,7 @@ from sb3_rpto.effects.simulation import memory, names_of
 from sb3_rpto.sysid.data import signal_quality
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
+from sb3_rpto.sysid.settings import DEFAULTS, ProblemSettings
 from sb3_rpto.sysid.shooting.initial_states import HALF_COUNT, HALF_WIDTH, TRUST, half_step, looseness, start_state
 
 #: Seconds of commands kept from before a window, for effects that delay and filter: four constants of the slowest lag.
@@ -37,8 +38,6 @@ ENOUGH_HELD, CLEARLY_LESS = 200, 0.85
 BLOCK = 1.0
 #: Some hundred transitions of a simulator are soon over, and no sensor's drift ties them: so many blocks, if shorter.
 ENOUGH_BLOCKS = 8
-#: Longest integration step in s for measured data.
-LONGEST = 0.002
 #: The Runge-Kutta method is stable up to 2.8 for the product of a step and the model's fastest rate; poses differ.
 STIFF = 2.0
 
@@ -160,7 +159,9 @@ def _differences(episode: Episode, column: int, order: int, held: bool) -> np.nd
     return found[~inside.any(axis=1)]
 
 
-def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco.MjModel:
+def discretised(
+    model: mujoco.MjModel, data: Measurements, fine: bool, settings: ProblemSettings = DEFAULTS.problem
+) -> mujoco.MjModel:
     """A copy of the model that integrates as the data ask for.
 
     A simulator's data are met by its own integrator and time step. The world knows no steps: measured data take steps
@@ -172,7 +173,7 @@ def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco
     if data.exact or data.simulated:
         copy.opt.timestep /= data.substeps
     else:
-        copy.opt.timestep = step_for(model, data)
+        copy.opt.timestep = step_for(model, data, settings)
         if fine and stiff(copy):
             copy.opt.integrator = int(_IMPLICIT.get(model.opt.integrator, _FAST))
         elif fine:
@@ -183,9 +184,9 @@ def discretised(model: mujoco.MjModel, data: Measurements, fine: bool) -> mujoco
     return copy
 
 
-def step_for(model: mujoco.MjModel, data: Measurements) -> float:
+def step_for(model: mujoco.MjModel, data: Measurements, settings: ProblemSettings) -> float:
     """The time step in s that measured data are simulated with: the model's own, or a whole part of it."""
-    longest = min(LONGEST, data.step)
+    longest = min(settings.longest_step, data.step)
     return float(model.opt.timestep / math.ceil(model.opt.timestep / longest - 1e-9))
 
 
