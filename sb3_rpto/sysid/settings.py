@@ -38,6 +38,34 @@ class ProblemSettings:
 
 
 @dataclass(frozen=True)
+class ConsistencySettings:
+    """What can be wrong between a model and recordings."""
+
+    #: Commands of which a larger share is outside the actuator's range are refused: they are in other units.
+    clipped_share: float = 0.5
+    #: A machine sampled at longer steps than this is said to be sampled slowly.
+    slow_step: float = 0.02
+    #: Samples farther apart than this, or nearer than this share of the model's step, are of times in another unit.
+    longest_step: float = 0.5
+    shortest_step: float = 0.01
+    #: Dry friction with a longer time constant than this creeps by more than the noise (MuJoCo's default: 0.02).
+    soft: float = 0.005
+    #: A response that is later than this many samples is reported; so many are looked at.
+    lag: int = 2
+    most_lag: int = 25
+    #: Fewest samples of a run that tell; samples in all, about two seconds for a small robot; runs, evenly spread.
+    samples: int = 30
+    samples_in_all: int = 40_000
+    runs: int = 100
+    #: Correlation that counts; where no other run is there to compare with; and by which a lag must improve it.
+    correlation: float = 0.5
+    certain_correlation: float = 0.7
+    lag_gain: float = 0.1
+    #: Needed and commanded force agree within this factor; a spring that the model lacks reverses them too.
+    slope: float = 3.0
+
+
+@dataclass(frozen=True)
 class OriginSettings:
     """Whether recordings are a machine's, or a simulator's own."""
 
@@ -246,6 +274,7 @@ class Settings:
     """All thresholds of a trace."""
 
     problem: ProblemSettings = ProblemSettings()
+    consistency: ConsistencySettings = ConsistencySettings()
     origin: OriginSettings = OriginSettings()
     refinement: RefinementSettings = RefinementSettings()
     comparison: ComparisonSettings = ComparisonSettings()

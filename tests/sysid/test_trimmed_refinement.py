@@ -140,7 +140,7 @@ def test_a_parameter_that_shows_nowhere_goes_back_to_where_it_may_show() -> None
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Costs of the fits that would be fit_trimmed; none is."""
+    """Costs of the fits that would be trimmed; none is."""
     costs: list[float] = []
 
     def seen(problem: Problem, fit: Fit, free: np.ndarray, settings: RefinementSettings) -> Fit:

@@ -73,7 +73,7 @@ class ExactStates(Hypothesis):
 
         Wrong numbers may explain recordings without noise that were taken for noisy ones.
         """
-        if not may_be_exact(problem.inputs.data):
+        if not may_be_exact(problem.inputs.data, problem.settings.consistency.slow_step):
             return False
         if not result.explains:
             return True

@@ -21,22 +21,10 @@ from sb3_rpto.sysid.data.inverse_dynamics_terms import actuation, inverse, throu
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.signal_quality import Finding, smoothed_velocity
 from sb3_rpto.sysid.problem.unsupported_elements import Hint, mocap_bodies, moved_by_mocap, of_actuator
-from sb3_rpto.sysid.settings import DEFAULTS, ProblemSettings
+from sb3_rpto.sysid.settings import DEFAULTS, ConsistencySettings, Settings
 from sb3_rpto.sysid.shooting.windows import command_order, discretised, stiff
 
 ALL = "all episodes"
-MOSTLY = 0.5
-"""Commands of which a larger share is outside the actuator's range are refused: they are in other units."""
-SLOW = 0.02
-"""A machine sampled at longer steps than this, in s, is said to be sampled slowly."""
-LONGEST_STEP = 0.5
-"""Samples farther apart than this, in s, are taken for times in another unit."""
-SHORTEST_STEP = 0.01
-"""Samples nearer to each other than this share of the model's step are taken for times in another unit."""
-SOFT = 0.005
-"""Dry friction with a longer time constant than this, in s, creeps by more than the noise (MuJoCo's default: 0.02)."""
-LAG = 2
-"""A response that is later than this many samples is reported."""
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # the first of the scalar ones
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _NO_DYNAMICS, _USER = int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtDyn.mjDYN_USER)
@@ -47,19 +35,9 @@ _STATES = {
     _USER: "dyntype user",
 }
 _NO_BIAS, _FIXED = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtGain.mjGAIN_FIXED)
-_MAX_LAG = 25
-_FEWEST = 30
-_BUDGET = 40_000  # samples in all: about two seconds for a small robot
-_MOST_RUNS = 100  # evenly spread over the data
-_STRONG = 0.5  # correlation that counts
-_CERTAIN = 0.7  # and where no other run is there to compare with
-_GAIN = 0.1  # by which a lag must improve it
-_SLOPE = 3.0  # needed and commanded force agree within this factor; a spring that the model lacks reverses them too
 
 
-def check_against(
-    model: mujoco.MjModel, data: Measurements, settings: ProblemSettings = DEFAULTS.problem
-) -> list[Finding]:
+def check_against(model: mujoco.MjModel, data: Measurements, settings: Settings = DEFAULTS) -> list[Finding]:
     """Check recordings against the model that is to explain them.
 
     Looked at: the names, the sampling, and by inverse dynamics of the smoothed motion whether each joint's actuators
@@ -68,6 +46,7 @@ def check_against(
 
     :param model: of the machine
     :param data: recordings, their names as in the model; the order of the columns does not matter
+    :param settings: thresholds
     :return: what was found, nothing is repaired
     :raises ValueError: joints or actuators that are not in both, or a wrong number of coordinates (the message names
         the nearest names), actuators that integrate their commands, a clock that is not in seconds, commands that are
@@ -75,10 +54,12 @@ def check_against(
     """
     check_names(model, data)
     _check_actuators(model)
-    check_clock(model, data)
+    limits = settings.consistency
+    check_clock(model, data, limits)
     _check_settings(model, data)
     check_degrees(model, data)
-    return _sampling(model, data, settings) + mocap_bodies(model) + _clipped(model, data) + _responses(model, data)
+    found = _sampling(model, data, settings) + mocap_bodies(model) + _clipped(model, data, limits)
+    return found + _responses(model, data, limits)
 
 
 def check_names(model: mujoco.MjModel, data: Measurements) -> None:
@@ -128,12 +109,12 @@ def _check_actuators(model: mujoco.MjModel) -> None:
             )
 
 
-def soft_friction(model: mujoco.MjModel) -> list[Finding]:
+def soft_friction(model: mujoco.MjModel, soft: float = DEFAULTS.consistency.soft) -> list[Finding]:
     """Joints that have dry friction in the model, and one that creeps; what is added to others holds."""
     found = []
     for joint, name in enumerate(object_names(model, "joint")):
         dof = model.jnt_dofadr[joint]
-        if model.dof_frictionloss[dof] > 0 and model.dof_solref[dof, 0] > SOFT:
+        if model.dof_frictionloss[dof] > 0 and model.dof_solref[dof, 0] > soft:
             message = (
                 f"dry friction gives way over some {1e3 * model.dof_solref[dof, 0]:g} ms (its solreffriction); a "
                 'machine\'s holds: set solreffriction="0.001 1" solimpfriction="0.99 0.99" in the model'
@@ -142,10 +123,10 @@ def soft_friction(model: mujoco.MjModel) -> list[Finding]:
     return found
 
 
-def soft_ties(model: mujoco.MjModel) -> list[Finding]:
+def soft_ties(model: mujoco.MjModel, soft: float = DEFAULTS.consistency.soft) -> list[Finding]:
     """Equality constraints that give way as MuJoCo's do where nothing else is said; those of a machine hardly do."""
     found = []
-    for tie in np.flatnonzero((model.eq_solref[:, 0] > SOFT) & (model.eq_active0 != 0)):
+    for tie in np.flatnonzero((model.eq_solref[:, 0] > soft) & (model.eq_active0 != 0)):
         if moved_by_mocap(model, int(tie)):  # which nobody knows to be where it is taken to be
             continue
         message = (
@@ -169,19 +150,21 @@ def carried_weights(model: mujoco.MjModel) -> list[Finding]:
     return [Finding("gravity compensation", f"body {', '.join(bodies)}", message)] if bodies else []
 
 
-def check_clock(model: mujoco.MjModel, data: Measurements) -> None:
+def check_clock(
+    model: mujoco.MjModel, data: Measurements, settings: ConsistencySettings = DEFAULTS.consistency
+) -> None:
     """Refuse samples so far apart, or so near to each other, that their times can hardly be in seconds.
 
     :raises ValueError: see :func:`check_against`
     """
     steps = [np.diff(e.time) for e in data.episodes if len(e) > 1]
     step = float(np.median(np.concatenate(steps))) if steps else 0.0
-    if not data.exact and step > LONGEST_STEP:
+    if not data.exact and step > settings.longest_step:
         raise ValueError(
             f"the median step of column 'time' is {step:g} s, the model's {model.opt.timestep:g} s; give times in "
             "seconds (are these milliseconds?), or sample the machine faster"
         )
-    if not data.exact and 0 < step < SHORTEST_STEP * model.opt.timestep:
+    if not data.exact and 0 < step < settings.shortest_step * model.opt.timestep:
         raise ValueError(
             f"the median step of column 'time' is {step:g} s, the model's {model.opt.timestep:g} s; give times in "
             "seconds"
@@ -203,7 +186,7 @@ def _check_settings(model: mujoco.MjModel, data: Measurements) -> None:
                 )
 
 
-def _sampling(model: mujoco.MjModel, data: Measurements, settings: ProblemSettings) -> list[Finding]:
+def _sampling(model: mujoco.MjModel, data: Measurements, settings: Settings) -> list[Finding]:
     if not data.episodes:
         return []
     found = []
@@ -215,10 +198,10 @@ def _sampling(model: mujoco.MjModel, data: Measurements, settings: ProblemSettin
             f"one of {step / max(1, np.ceil(step / timestep)):.6g} s would be"
         )
         found.append(Finding("sampling", f"{ALL}, time", message))
-    if not (data.exact or data.simulated) and stiff(discretised(model, data, fine=False, settings=settings)):
+    if not (data.exact or data.simulated) and stiff(discretised(model, data, fine=False, settings=settings.problem)):
         message = "too stiff for the Runge-Kutta method at this timestep: integrated implicitly, less finely"
         found.append(Finding("stiff model", "the model", message))
-    if step > 1.01 * SLOW and not data.exact:
+    if step > 1.01 * settings.consistency.slow_step and not data.exact:
         message = (
             f"the median step is {step:.4g} s; effects faster than that, such as a short delay, leave no trace, and "
             "what the motion does between samples passes for an error of the model: log faster, or, of a "
@@ -228,7 +211,7 @@ def _sampling(model: mujoco.MjModel, data: Measurements, settings: ProblemSettin
     return found
 
 
-def _clipped(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
+def _clipped(model: mujoco.MjModel, data: Measurements, settings: ConsistencySettings) -> list[Finding]:
     """Commands outside an actuator's range, where the simulation clips them."""
     found = []
     for column, (name, i) in enumerate(zip(data.columns.ctrl, command_order(model, data))):
@@ -236,7 +219,7 @@ def _clipped(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
         slack = 1e-3 * (high - low)
         commands = np.concatenate([e.ctrl[:, column] for e in data.episodes])
         beyond = float(np.mean((commands < low - slack) | (commands > high + slack)))
-        if model.actuator_ctrllimited[i] and beyond > MOSTLY:
+        if model.actuator_ctrllimited[i] and beyond > settings.clipped_share:
             raise ValueError(
                 f"column 'ctrl.{name}': {beyond:.0%} of the samples are outside the model's ctrlrange [{low:g}, "
                 f"{high:g}], where it clips them; give commands in the units of the model's ctrl (a motor's force is "
@@ -296,20 +279,22 @@ class _Force:
     clear: np.ndarray  # (T,), bool: nothing else is in the way
 
 
-def _responses(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
+def _responses(model: mujoco.MjModel, data: Measurements, settings: ConsistencySettings) -> list[Finding]:
     """Late or reversed forces, judged by the correlation of what moves a joint with what it was told."""
     forces: dict[str, dict[str, list[_Force]]] = {}
-    for force in _forces(model, data):
+    for force in _forces(model, data, settings):
         forces.setdefault(force.where, {}).setdefault(force.run, []).append(force)
     found = []
     for where, runs in forces.items():
-        correlations = {run: c for run, parts in runs.items() if (c := _correlate(parts)) is not None}
+        correlations = {run: c for run, parts in runs.items() if (c := _correlate(parts, settings)) is not None}
         if not correlations:
             continue
         strength = np.mean([np.abs(c[0]) for c in correlations.values()], axis=0)
         lag = int(np.argmax(strength))
-        right = np.mean([c[0][lag] > 0 and 1 / _SLOPE <= c[1][lag] <= _SLOPE for c in correlations.values()])
-        if lag > LAG and right > 0.5 and strength[lag] >= max(_CERTAIN, strength[0] + _GAIN):
+        slope, certain = settings.slope, settings.certain_correlation
+        right = np.mean([c[0][lag] > 0 and 1 / slope <= c[1][lag] <= slope for c in correlations.values()])
+        late = lag > settings.lag and right > 0.5
+        if late and strength[lag] >= max(certain, strength[0] + settings.lag_gain):
             step = data.step
             message = (
                 f"the motion follows about {lag} samples ({lag * step:.3g} s) late: a delay or lag in the actuator, or "
@@ -317,17 +302,18 @@ def _responses(model: mujoco.MjModel, data: Measurements) -> list[Finding]:
             )
             found.append(Finding("late response", f"{ALL}, {where}", message))
         else:
-            lag = int(np.argmax(strength[: LAG + 1]))
-        found += _signs(where, {run: (c[0][lag], c[1][lag]) for run, c in correlations.items()})
+            lag = int(np.argmax(strength[: settings.lag + 1]))
+        found += _signs(where, {run: (c[0][lag], c[1][lag]) for run, c in correlations.items()}, settings)
     return found
 
 
-def _signs(where: str, fits: dict[str, tuple[float, float]]) -> list[Finding]:
+def _signs(where: str, fits: dict[str, tuple[float, float]], settings: ConsistencySettings) -> list[Finding]:
     """Runs whose correlation and slope speak for a flipped sign."""
-    flipped = [run for run, (c, slope) in fits.items() if c <= -_STRONG and -_SLOPE <= slope <= -1 / _SLOPE]
-    right = [run for run, (c, _) in fits.items() if c >= _STRONG]
+    strong, most = settings.correlation, settings.slope
+    flipped = [run for run, (c, slope) in fits.items() if c <= -strong and -most <= slope <= -1 / most]
+    right = [run for run, (c, _) in fits.items() if c >= strong]
     mean = np.mean([c for c, _ in fits.values()])
-    if len(flipped) == len(fits) and mean <= -_CERTAIN:
+    if len(flipped) == len(fits) and mean <= -settings.certain_correlation:
         message = (
             f"in every run the motion needs the opposite force (correlation {mean:.2f}): "
             "its sign is flipped, or the model lacks a force larger than those it has; kept as it is"
@@ -339,10 +325,12 @@ def _signs(where: str, fits: dict[str, tuple[float, float]]) -> list[Finding]:
     return [Finding.of_run("flipped sign", run, where, message.format(fits[run][0])) for run in flipped]
 
 
-def _correlate(parts: list[_Force]) -> tuple[np.ndarray, np.ndarray] | None:
+def _correlate(
+    parts: list[_Force], settings: ConsistencySettings = DEFAULTS.consistency
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Correlation, and slope of needed against given force, by lag in samples; None where there is too little."""
-    correlations, slopes = np.zeros(_MAX_LAG + 1), np.zeros(_MAX_LAG + 1)
-    for lag in range(_MAX_LAG + 1):
+    correlations, slopes = np.zeros((2, settings.most_lag + 1))
+    for lag in range(settings.most_lag + 1):
         pairs = [
             (p.needed[lag:][p.clear[lag:]], p.given[: len(p.given) - lag][p.clear[lag:]])
             for p in parts
@@ -350,7 +338,7 @@ def _correlate(parts: list[_Force]) -> tuple[np.ndarray, np.ndarray] | None:
         ]
         needed, given = (np.concatenate(x) for x in zip(*pairs)) if pairs else (np.empty(0), np.empty(0))
         # What is constant varies by rounding.
-        if len(given) < _FEWEST or any(np.std(x) <= 1e-9 * (1 + np.abs(x).max()) for x in (needed, given)):
+        if len(given) < settings.samples or any(np.std(x) <= 1e-9 * (1 + np.abs(x).max()) for x in (needed, given)):
             if lag == 0:
                 return None
             continue
@@ -359,19 +347,19 @@ def _correlate(parts: list[_Force]) -> tuple[np.ndarray, np.ndarray] | None:
     return correlations, slopes
 
 
-def _forces(model: mujoco.MjModel, data: Measurements) -> Iterator[_Force]:
+def _forces(model: mujoco.MjModel, data: Measurements, settings: ConsistencySettings) -> Iterator[_Force]:
     own = columns_of(model)
     order = {
         name: [getattr(data.columns, name).index(n) for n in getattr(own, name)] for name in ("qpos", "qvel", "ctrl")
     }
-    runs = list(dict.fromkeys(e.run for e in data.episodes if len(e) >= _FEWEST))
-    runs = runs[:: -(-len(runs) // _MOST_RUNS) or 1]
-    left = dict.fromkeys(runs, _BUDGET // max(1, len(runs)))
+    runs = list(dict.fromkeys(e.run for e in data.episodes if len(e) >= settings.samples))
+    runs = runs[:: -(-len(runs) // settings.runs) or 1]
+    left = dict.fromkeys(runs, settings.samples_in_all // max(1, len(runs)))
     nominal, simulation = model, Simulation(model, [], 1)
     for episode in data.episodes:
         rows = slice(0, left.get(episode.run, 0))
         n = len(episode.time[rows])
-        if n < _FEWEST:
+        if n < settings.samples:
             continue
         left[episode.run] -= n
         model = nominal

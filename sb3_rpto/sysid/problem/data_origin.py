@@ -13,7 +13,6 @@ import numpy as np
 from sb3_rpto.effects import Effect, Simulation
 from sb3_rpto.effects.library import given
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.problem.data_model_consistency import SLOW
 from sb3_rpto.sysid.problem.inverse_dynamics import force_residuals, typical
 from sb3_rpto.sysid.settings import DEFAULTS, OriginSettings, Settings
 from sb3_rpto.sysid.shooting.multiple_shooting import Problem
@@ -22,14 +21,14 @@ from sb3_rpto.sysid.shooting.windows import cut, discretised, noise_levels
 Origin: TypeAlias = Literal["machine", "simulated", "exact"]
 
 
-def may_be_exact(data: Measurements) -> bool:
+def may_be_exact(data: Measurements, slow: float = DEFAULTS.consistency.slow_step) -> bool:
     """Whether noise cannot be told from motion, so that recordings that seem noisy may be a simulator's, without any.
 
     Where commands change from one slow sample to the next the motion between them is not smooth. All velocities are to
     be known, as predictions would begin at the samples themselves.
     """
     step = data.step
-    return not (data.whole_states or data.columns.missing or data.unobserved) and bool(step >= SLOW)
+    return not (data.whole_states or data.columns.missing or data.unobserved) and bool(step >= slow)
 
 
 def idle(

@@ -237,7 +237,7 @@ class IdentificationProblem:
             )
         return every, None
 
-    def _longer_windows(self) -> float | None:
+    def longer_horizon(self) -> float | None:
         """Length of the windows to go on with, in s, where the data hold enough of them to select on."""
         settings = self.settings.problem
         longer = settings.longer_windows * self.length
@@ -265,7 +265,8 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
     )
     data, turned = settle_turns(compiled, data)
     data, clock = settle_clock(data)
-    findings = [*data.findings, *turned, *clock, *check_against(compiled, data, settings), *_own_step(inputs.model)]
+    checked = check_against(compiled, data, inputs.settings)
+    findings = [*data.findings, *turned, *clock, *checked, *_own_step(inputs.model)]
     given(compiled, declared, known)  # what is wrong there is said before the work
     roomy = with_room(spec, compiled, data, settings)
     parts = data.split(inputs.seed)
@@ -285,9 +286,8 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
         message = f"{changes:.1f} a second come or go; windows of {length:.2g} s, as errors about a touch-down grow"
         findings.append(Finding("contacts", "fitted runs", message))
     # What was told need not be found out.
-    seems = (
-        "told" if data.simulated else origin(roomy, fitted, declared, sigma, length, threads, known, inputs.settings)
-    )
+    asked = (declared, sigma, length, threads, known, inputs.settings)
+    seems = "told" if data.simulated else origin(roomy, fitted, *asked)
     if seems in ("simulated", "exact"):
         exact = seems == "exact"
         data = replace(data, simulated=True, exact=exact, noise=None if exact else data.noise)
@@ -300,21 +300,21 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
     nominal = discretised(roomy, fitted, fine=True, settings=settings)
     there = given(nominal, declared, known, assumptions.soft_friction)
     if seems == "machine" and not data.exact:
-        findings += soft_friction(nominal) + soft_ties(nominal) + carried_weights(nominal)
+        soft = inputs.settings.consistency.soft
+        findings += soft_friction(nominal, soft) + soft_ties(nominal, soft) + carried_weights(nominal)
     kinds = inputs.candidates if assumptions.kinds is None else assumptions.kinds
     effects = _effects(nominal, data, there, kinds)
     findings += _without_a_place(nominal, kinds)
     fine = Simulation(nominal, effects, threads)
     if (data.exact or data.simulated) and idle(fine, fitted, sigma, inputs.settings.origin):
         data = replace(data, idle=True)
-    scales = typical(fine, force_residuals(fine, fine.null, replace(data, episodes=fitted.episodes))).scales(
-        fine.effects
-    )
+    residuals = force_residuals(fine, fine.null, replace(data, episodes=fitted.episodes))
+    scales = typical(fine, residuals).scales(fine.effects)
     rough = Simulation(discretised(roomy, fitted, fine=False, settings=settings), effects, threads)
     problem = IdentificationProblem(
         inputs, assumptions, spec, compiled, findings, data, split, sigma, fine, rough, scales, length
     )
-    return replace(problem, longer=problem._longer_windows()) if inputs.horizon is None else problem
+    return replace(problem, longer=problem.longer_horizon()) if inputs.horizon is None else problem
 
 
 def _effects(

@@ -50,9 +50,8 @@ def refit(problem: IdentificationProblem, result: SearchResult) -> FinalFit:
     values, intervals, correlation = fit_with_intervals(result.selection, windows, settings)
     # Both models are fitted to all these data before they are compared on the test runs, the declared one as recorded.
     recorded = windows if result.as_recorded is None else result.first.on.fine.all_windows()
-    declared = recorded.fit(
-        result.first.base.fit.values, selector.free(()), iterations=settings.final_iterations, crude=0.0
-    ).values
+    begin, iterations = result.first.base.fit.values, settings.final_iterations
+    declared = recorded.fit(begin, selector.free(()), iterations=iterations, crude=0.0).values
     free = selector.free(named)
     return FinalFit(windows, declared, values, intervals, correlation, named, free, selector.horizon)
 
@@ -86,9 +85,8 @@ def fit_with_intervals(
         values[hidden] = problem.null[hidden]
         r = problem.residuals(np.tile(fit.values, (len(joined), 1)), fit.starts, np.arange(len(joined)))
         r = r[np.repeat(joined.usable, joined.measured.shape[2], axis=1)]
-        half = (
-            half_widths(linear, joined.block, settings.interval_blocks) * problem.size[free] / Loss.of(r).curvature(r)
-        )
+        widths = half_widths(linear, joined.block, settings.interval_blocks)
+        half = widths * problem.size[free] / Loss.of(r).curvature(r)
         intervals[:, free] = fit.values[free] + np.array([-1, 1])[:, None] * half
         intervals = np.clip(intervals, problem.lower, problem.upper)
         intervals[:, hidden] = intervals[:, alike] = np.nan

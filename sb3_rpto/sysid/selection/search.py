@@ -422,11 +422,8 @@ def assess(selector: Selector, model: Model, seed: int) -> Adequacy:
         return seen
     count, train = len(selector.select.windows), selector.train
     fitted = adequacy(train, train.score(values, iterations=START_STEPS), seed, settings.adequacy)
-    return (
-        counted_with(seen, count, fitted, len(train.windows))
-        if count < settings.selection.few_windows or fitted.spread
-        else seen
-    )
+    few = count < settings.selection.few_windows
+    return counted_with(seen, count, fitted, len(train.windows)) if few or fitted.spread else seen
 
 
 # --- a few kinds, each at all its places ------------------------------------------------------------------------------
@@ -451,16 +448,14 @@ def select_groups(selector: Selector, screening: Screening, base: Fit) -> Model 
         for (kind, _), places in selector.group_by_kind(shown, apart=True).items():
             selector.say(0.0, f"{kind} at all places")
             together = [*chosen, *places]
-            fits.append(
-                (together, train.fit(fit.values, selector.free(together), fit.starts, settings.joint_iterations))
-            )
+            free = selector.free(together)
+            fits.append((together, train.fit(fit.values, free, fit.starts, settings.joint_iterations)))
         nearest = sorted(fits, key=lambda found: found[1].cost)[: settings.kinds_refined]
         led = []
         for together, begun in sorted(nearest, key=lambda found: len(selector.free(found[0]))):
             begun = fit_trimmed(train, begun, selector.free(together), selector.settings.refinement)
-            if np.median(begun.errors) < max(
-                FAR, settings.gain_far * np.median(base.errors)
-            ):  # else kinks are not all it lacks
+            # Else kinks are not all that it lacks.
+            if np.median(begun.errors) < max(FAR, settings.gain_far * np.median(base.errors)):
                 model = selector.refine(selector.fit_model(together, begun))
                 if selector.fits_exactly(model) if train.exact else not selector.model_error_dominates(model):
                     return model
@@ -517,10 +512,8 @@ def _one_more(selector: Selector, model: Model) -> Model | None:
     error, e, values = min(tried, key=lambda one: one[0], default=(np.inf, 0, model.fit.values))
     if error > (1 - settings.gain_far) * typical(model.fit.errors[some]):
         return None
-    trial = selector.fit_model_from(
-        [*{*model.effects, e}], replace(model.fit, values=values, linear=None), settings.joint_iterations
-    )
-    trial = selector.refine(trial)
+    begin = replace(model.fit, values=values, linear=None)
+    trial = selector.refine(selector.fit_model_from([*{*model.effects, e}], begin, settings.joint_iterations))
     return trial if np.sum(trial.fit.errors > limit) < len(missed) else None
 
 

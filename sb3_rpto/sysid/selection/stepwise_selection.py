@@ -111,14 +111,11 @@ class Selector:
         :param begin: where the fit begins
         :return: the model of all, and that of the best few kinds where it was needed
         """
-        free = self.free(effects)
-        best, few = (
-            self.train.fit(begin.values, free, begin.starts, self.thresholds.joint_iterations, tolerance=3e-3),
-            None,
-        )
+        free, iterations, few = self.free(effects), self.thresholds.joint_iterations, None
+        best = self.train.fit(begin.values, free, begin.starts, iterations, tolerance=3e-3)
         if np.median(best.errors) > self.thresholds.enough:
             few = self._best_few(effects, base)
-            other = self.train.fit(few.fit.values, free, base.starts, self.thresholds.joint_iterations, tolerance=3e-3)
+            other = self.train.fit(few.fit.values, free, base.starts, iterations, tolerance=3e-3)
             best = min(best, other, key=lambda fit: fit.cost)
         return self.fit_model(effects, best), few
 
@@ -185,9 +182,8 @@ class Selector:
         if not shapes.any():
             return model
         values = np.where(shapes, self.simulation.null, begin.values)
-        return self.fit_model_from(
-            model.effects, replace(begin, values=values, linear=None), self.thresholds.refit_iterations
-        )
+        begin = replace(begin, values=values, linear=None)
+        return self.fit_model_from(model.effects, begin, self.thresholds.refit_iterations)
 
     def _less(self, values: np.ndarray, key: Sequence[int]) -> np.ndarray:
         """Parameters at which all effects but the given and the known ones have no influence."""
@@ -201,9 +197,8 @@ class Selector:
         """A model that errs more than need be, out of kinks that may hold its fit; exact data can be met exactly."""
         if not (self.train.exact or self.train.touching or self.model_error_dominates(model)):
             return model
-        return self._remembered(
-            model.effects, refine(self.train, model.fit, self.free(model.effects), self.settings.refinement)
-        )
+        fit = refine(self.train, model.fit, self.free(model.effects), self.settings.refinement)
+        return self._remembered(model.effects, fit)
 
     def _remembered(self, effects: tuple[int, ...], fit: Fit) -> Model:
         fit = replace(fit, linear=self.train.linear(fit, self.free(effects)))
@@ -297,12 +292,10 @@ class Selector:
         """Evidence for each kept effect against the model without it; what is not clear goes."""
         selection = self.eliminate(selection)
         while True:
-            current = selection.model
+            current, iterations = selection.model, self.thresholds.refit_iterations + 3
             selection.evidence = {}
             for e in current.effects:
-                without = self.fit_model(
-                    [i for i in current.effects if i != e], current.fit, self.thresholds.refit_iterations + 3
-                )
+                without = self.fit_model([i for i in current.effects if i != e], current.fit, iterations)
                 selection.evidence[e] = self.evidence(current, without)
             weak = [e for e, evidence in selection.evidence.items() if not evidence.clear(*self.limit(current))]
             if not weak:
@@ -331,9 +324,8 @@ class Selector:
         """
         for _ in range(self.thresholds.rounds if rounds is None else rounds):
             current = selection.model
-            if np.median(current.errors) < self.thresholds.enough and not several_missed(
-                current.errors, self.blocks, self.settings.comparison
-            ):
+            missed = several_missed(current.errors, self.blocks, self.settings.comparison)
+            if np.median(current.errors) < self.thresholds.enough and not missed:
                 break
             tried: list[tuple[float, Model, int]] = []
             for e, begin in self.most_promising(current, [c for c in candidates if c not in current.effects]):
@@ -379,12 +371,10 @@ class Selector:
         some = np.arange(0, len(self.train.windows), 3)
         part, begin = self.train.on(some), model.fit.starts[some]
         base = part.fit(model.fit.values, self.free(model.effects), begin, 3)
-        gains, fits, starts = {}, {}, {}
+        gains, fits, starts, iterations = {}, {}, {}, self.thresholds.refit_iterations + 1
         for e, begins in self._promised(part, base, model.effects, outside).items():
             free = self.free([*model.effects, e])
-            trials = [
-                (b.values, part.fit(b.values, free, base.starts, self.thresholds.refit_iterations + 1)) for b in begins
-            ]
+            trials = [(b.values, part.fit(b.values, free, base.starts, iterations)) for b in begins]
             starts[e], fits[e] = min(trials, key=lambda trial: trial[1].cost)
             gained = float(np.mean(np.log(base.errors) - np.log(fits[e].errors)))
             gains[e] = max(gained, 1 - fits[e].cost / base.cost)
@@ -414,14 +404,12 @@ class Selector:
         smaller = self.fit_model(rest, model.fit)
         outside = [e for e in candidates if e not in model.effects]
         for e, begins in self._promised(self.train, smaller.fit, rest, outside).items():
-            effects = sorted([*rest, e])
-            if len(self.free(effects)) >= len(self.free(model.effects)):
+            effects, iterations = sorted([*rest, e]), self.thresholds.joint_iterations
+            free = self.free(effects)
+            if len(free) >= len(self.free(model.effects)):
                 continue
             self.say(1.0, f"{self.simulation.effects[e].label} in the place of several")
-            fits = [
-                self.train.fit(b.values, self.free(effects), smaller.fit.starts, self.thresholds.joint_iterations)
-                for b in begins
-            ]
+            fits = [self.train.fit(b.values, free, smaller.fit.starts, iterations) for b in begins]
             trial = self._remembered(tuple(effects), min(fits, key=lambda fit: fit.cost))
             if self.nearly_fits_exactly(trial) and not self.fits_exactly(trial):
                 trial = self.refine(trial)

@@ -91,12 +91,8 @@ class Substitution:
         """
         stands = [(e, one) for e in pair for one in selection.alike.get(e, []) if one not in model.effects]
         for e, one in sorted(stands, key=lambda stand: len(self.effects[stand[1]].parameters)):
-            yield (
-                one,
-                self.selector.fit_model_from(
-                    [*rest, one], self._exchanged(model, e, one).fit, self.settings.iterations
-                ),
-            )
+            begin = self._exchanged(model, e, one).fit
+            yield one, self.selector.fit_model_from([*rest, one], begin, self.settings.iterations)
         outside = [i for i in range(len(self.effects)) if i not in rest and self.screening.excited(i)]
         outside = [i for i in outside if not self.effects[i].known]
         for one, begin in self.selector.most_promising(self.selector.fit_model(rest, model.fit), outside):
@@ -157,9 +153,8 @@ class Substitution:
         counts = Counter(self.kinds[e] for e in model.effects)
         for usual in sorted(kind for kind, places in counts.items() if places > 1):
             for kind in sorted({*self.kinds} - {"declared", usual}):
-                swaps = {
-                    e: i for e, i in self._swaps(model, kind, self.settings.akin).items() if self.kinds[e] == usual
-                }
+                swaps = self._swaps(model, kind, self.settings.akin)
+                swaps = {e: i for e, i in swaps.items() if self.kinds[e] == usual}
                 if len(swaps) < counts[usual] or any(i in selection.alike.get(e, []) for e, i in swaps.items()):
                     continue
                 self.selector.say(1.0, f"{kind} in all places of {usual}")
@@ -176,11 +171,8 @@ class Substitution:
         if self.selector.fits_exactly(model):  # nothing could be better
             return model
         for kind in sorted({*self.kinds} - {"declared"}):
-            swaps = self._swaps(
-                model,
-                kind,
-                self.settings.like if kind in {self.kinds[e] for e in model.effects} else self.settings.akin,
-            )
+            kept = kind in {self.kinds[e] for e in model.effects}
+            swaps = self._swaps(model, kind, self.settings.like if kept else self.settings.akin)
             if len(swaps) < 2:
                 continue
             self.selector.say(1.0, f"{kind} in all places")
@@ -204,11 +196,8 @@ class Substitution:
         slices, begin = self.selector.simulation.slices, replace(model.fit, values=model.fit.values.copy(), linear=None)
         for old, new in swaps.items():
             begin.values[slices[new]] = self._translated(model, old, new).values[slices[new]]
-        return self.selector.fit_model(
-            sorted({swaps.get(e, e) for e in model.effects}),
-            begin,
-            2 * self.selector.thresholds.refit_iterations,
-        )
+        effects = sorted({swaps.get(e, e) for e in model.effects})
+        return self.selector.fit_model(effects, begin, 2 * self.selector.thresholds.refit_iterations)
 
     def _excited(self, kind: str) -> list[int]:
         """The places of a kind that the data could show."""
@@ -232,9 +221,8 @@ class Substitution:
         if self._twins(old, new) and found.fit.cost > model.fit.cost:
             slices, values = self.selector.simulation.slices, model.fit.values.copy()
             values[slices[new]] = values[slices[old]]
-            return self.selector.fit_model_from(
-                effects, replace(model.fit, values=values, linear=None), self.settings.iterations
-            )
+            begin = replace(model.fit, values=values, linear=None)
+            return self.selector.fit_model_from(effects, begin, self.settings.iterations)
         return found
 
     def _twins(self, a: int, b: int) -> bool:
@@ -246,10 +234,8 @@ class Substitution:
 
         What windows err by that were not fitted is known to first order, and at a kink by less than tells twins apart.
         """
-        train = self.selector.train
-        gained = compare(
-            twin.fit.errors, model.fit.errors, train.windows.block, not train.exact, self.selector.settings.comparison
-        )
+        train, settings = self.selector.train, self.selector.settings.comparison
+        gained = compare(twin.fit.errors, model.fit.errors, train.windows.block, not train.exact, settings)
         return gained.clear(*self.selector.limit(model))
 
     def _translated(self, model: Model, old: int, new: int) -> Fit:
@@ -266,19 +252,16 @@ class Substitution:
         return replace(model.fit, values=np.clip(values, train.lower, train.upper), linear=None)
 
     def _better(self, a: Model, b: Model) -> bool:
-        """Whether one of two substitution does better: near the noise that seems so soon, far from it it must be clear.
+        """Whether one of two does better: near the noise that seems so soon, far from it, it must be clear.
 
         Where the other meets exact data, one that is far nearer still is right, though no window denies the other.
         """
-        if (
-            self.selector.fits_exactly(b)
-            and self.settings.errs < b.fit.errors.max() > a.fit.errors.max() / self.settings.right
-        ):
+        worst, least = b.fit.errors.max(), a.fit.errors.max() / self.settings.right
+        if self.selector.fits_exactly(b) and self.settings.errs < worst > least:
             return True
         far = self.selector.model_error_dominates(a)
-        return self.selector.evidence(a, b).clear(
-            *(self.selector.limit(a) if far else (self.seems, self.selector.least_gain))
-        )
+        limit = self.selector.limit(a) if far else (self.seems, self.selector.least_gain)
+        return self.selector.evidence(a, b).clear(*limit)
 
     def _simpler(self, a: int, b: int) -> bool:
         return len(self.effects[a].parameters) < len(self.effects[b].parameters)
