@@ -10,7 +10,7 @@ from scipy.stats import binom
 from simulated import problem, recorded
 
 from sb3_rpto.effects.friction import CoulombFriction
-from sb3_rpto.sysid.selection.adequacy import Adequacy, adequacy, counted_with
+from sb3_rpto.sysid.selection.adequacy import Adequacy, adequacy, count_strays_with
 from sb3_rpto.sysid.settings import DEFAULTS
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
 
@@ -172,8 +172,8 @@ def test_either_the_ratio_or_the_strays_make_it_inadequate() -> None:
 def test_stray_windows_of_a_fit_are_counted_with_those_of_a_few_others() -> None:
     select, fitted = Adequacy(1.03, 0.9, 1.2, 1 / 3, 0.0057), Adequacy(1.0, 0.9, 1.1, 4 / 16, 1.0)
     assert select.adequate
-    both = counted_with(select, 6, fitted, 16)
+    both = count_strays_with(select, 6, fitted, 16)
     assert both.strays == 6 / 22
     assert both.chance == pytest.approx(binom.sf(5, 22, 0.02))
     assert not both.adequate
-    assert counted_with(select, 6, replace(fitted, strays=0.0), 16).chance == 0.0057  # they are no excuse
+    assert count_strays_with(select, 6, replace(fitted, strays=0.0), 16).chance == 0.0057  # they are no excuse

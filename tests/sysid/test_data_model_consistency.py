@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.sysid import Measurements
-from sb3_rpto.sysid.problem.data_model_consistency import _correlate, _Force, check_against, doubts
+from sb3_rpto.sysid.problem.data_model_consistency import _correlate, _Force, check_against, unlikely_columns
 
 ARM = """<mujoco>
   <option timestep="0.002" integrator="implicitfast"/>
@@ -216,7 +216,7 @@ def test_angles_that_may_be_degrees_and_commands_that_never_change():
     for table in tables.values():
         table["qpos.elbow"], table["qvel.elbow"] = (np.degrees(table[f"{q}.elbow"]) for q in ("qpos", "qvel"))
         table["ctrl.second"] = 0 * table["ctrl.second"]
-    said = [(f.kind, f.where) for f in doubts(model_of(), Measurements.from_tables(tables))]
+    said = [(f.kind, f.where) for f in unlikely_columns(model_of(), Measurements.from_tables(tables))]
     assert said == [
         ("large angle", "all episodes, qpos.elbow"),
         ("constant command", "all episodes, ctrl.second"),
@@ -227,7 +227,7 @@ def test_angles_that_may_be_degrees_and_commands_that_never_change():
 def test_motors_whose_force_the_model_limits(most, told):
     model = model_of()
     model.actuator_forcelimited[1], model.actuator_forcerange[1] = 1, (-most, most)
-    found = doubts(model, Measurements.from_tables(measured(model_of())))  # commands of up to 0.6
+    found = unlikely_columns(model, Measurements.from_tables(measured(model_of())))  # commands of up to 0.6
     assert [(f.kind, f.where) for f in found] == [("limited force", "all episodes, ctrl.second")] * told
 
 

@@ -9,7 +9,7 @@ from sb3_rpto.effects import LIBRARY
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Measurements, trace
-from sb3_rpto.sysid.problem.data_origin import may_be_exact, met_exactly, origin
+from sb3_rpto.sysid.problem.data_origin import are_exact_states, find_origin, may_be_exact
 from sb3_rpto.sysid.problem.problem import Assumptions, Inputs, prepare
 
 #: semi-implicit steps of 5 ms err by far more than a tenth of a milliradian
@@ -32,20 +32,20 @@ def test_a_complete_simulator_that_was_logged_is_complete(noise: float) -> None:
 def test_a_machine_whose_motion_is_continuous_is_none() -> None:
     fine = compiled(OWN.replace('timestep="0.005"', 'timestep="0.001" integrator="RK4"'))
     data = recorded([], fine, episodes=3, noise=1e-4)
-    assert origin(compiled(OWN), data, DECLARED, np.array([1e-4]), 0.4, 1) == "machine"
+    assert find_origin(compiled(OWN), data, DECLARED, np.array([1e-4]), 0.4, 1) == "machine"
 
 
 def test_what_is_missing_is_not_taken_for_steps() -> None:
     fine = compiled(OWN.replace('timestep="0.005"', 'timestep="0.001" integrator="RK4"'))
     data = recorded([CoulombFriction("hinge", level=0.1)], fine, episodes=3)
-    assert origin(compiled(OWN), data, DECLARED, np.array([1e-3]), 0.4, 1) == "machine"
+    assert find_origin(compiled(OWN), data, DECLARED, np.array([1e-3]), 0.4, 1) == "machine"
 
 
 @pytest.mark.slow
 def test_own_steps_are_recognised_once_what_is_missing_is_found() -> None:
     """At first a large friction hides how the steps err; found, it is out of the way, and the search begins anew."""
     data = recorded([CoulombFriction("hinge", level=0.3)], compiled(OWN), noise=1e-3)
-    assert origin(compiled(OWN), data, DECLARED, np.array([1e-3]), 0.8, 1) == "machine"
+    assert find_origin(compiled(OWN), data, DECLARED, np.array([1e-3]), 0.8, 1) == "machine"
     report = trace(OWN, data, DECLARED, candidates=["coulomb_friction"], threads=1)
     assert report.verdict == "explained"
     assert ["searched again" in f.message for f in report.findings if f.kind == "simulated"] == [True]
@@ -54,7 +54,7 @@ def test_own_steps_are_recognised_once_what_is_missing_is_found() -> None:
 
 
 def test_what_is_told_to_be_simulated_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_rpto.sysid.problem.problem.origin", lambda *_: pytest.fail("it was told"))
+    monkeypatch.setattr("sb3_rpto.sysid.problem.problem.find_origin", lambda *_: pytest.fail("it was told"))
     inputs = Inputs(OWN, recorded([], compiled(OWN)), DECLARED, candidates=[], horizon=0.4, threads=1)
     task = prepare(inputs, Assumptions(simulated=True))
     assert task.fitted.simulated
@@ -91,8 +91,8 @@ def test_a_simulator_that_was_logged_as_slowly_as_it_is_commanded_is_exact(offse
 def test_states_without_noise_are_met_with_what_was_found(noise: float) -> None:
     friction = CoulombFriction("hinge", level=0.2)
     data = recorded([friction], compiled(OWN), episodes=3, rate=40, noise=noise)
-    assert not met_exactly(compiled(OWN), data, DECLARED, 0.4, 1)
-    assert met_exactly(compiled(OWN), data, DECLARED, 0.4, 1, [friction]) == (noise == 0)
+    assert not are_exact_states(compiled(OWN), data, DECLARED, 0.4, 1)
+    assert are_exact_states(compiled(OWN), data, DECLARED, 0.4, 1, [friction]) == (noise == 0)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from sb3_rpto.sysid import Measurements, trace
 from sb3_rpto.sysid.data.signal_quality import align_quaternions
 from sb3_rpto.sysid.problem.data_model_consistency import check_against
 from sb3_rpto.sysid.problem.inverse_dynamics import force_residuals, summary
-from sb3_rpto.sysid.shooting.windows import discretised, stiff
+from sb3_rpto.sysid.shooting.windows import discretised, is_stiff
 
 RATE, FINE = 200, 50
 MOTOR = '<motor name="motor" joint="hinge"/>'
@@ -197,7 +197,7 @@ def test_the_fastest_rate_of_a_damped_joint_decides_whether_a_model_is_stiff() -
     inertia = 0.5 * 0.5**2 / 3 + 1e-4  # of a thin rod about its end, nearly
     for factor, expected in ((0.7, False), (1.4, True)):
         model.dof_damping[0] = factor * 2.0 * inertia / model.opt.timestep
-        assert stiff(model) == expected
+        assert is_stiff(model) == expected
 
 
 def test_a_servo_that_is_off_leaves_no_missing_force() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from sb3_rpto.effects import Drive, Simulation
 from sb3_rpto.sysid import Measurements
-from sb3_rpto.sysid.problem.problem import with_room
+from sb3_rpto.sysid.problem.problem import make_room_for_delays
 from sb3_rpto.sysid.settings import DEFAULTS
 from sb3_rpto.sysid.shooting.windows import discretised
 
@@ -32,7 +32,7 @@ def test_a_delay_lasts_in_the_shorter_steps_of_measured_data(shorter: int) -> No
     spec = mujoco.MjSpec.from_string(DELAYED)
     compiled = spec.compile()
     compiled.dof_damping[0] = 0.3  # as an environment may have set it
-    roomy = with_room(spec, compiled, DATA)
+    roomy = make_room_for_delays(spec, compiled, DATA)
     assert roomy.dof_damping[0] == 0.3
     model = discretised(roomy, DATA, fine=True)
     model.opt.timestep /= shorter
@@ -43,6 +43,6 @@ def test_a_delay_lasts_in_the_shorter_steps_of_measured_data(shorter: int) -> No
 
 def test_where_nothing_tells_the_mjcf_the_samples_that_a_delay_takes_are_named() -> None:
     with pytest.raises(ValueError, match=r"'motor' is delayed by 0.02 s and holds nsample=5.*nsample=\"40\": write"):
-        with_room(None, mujoco.MjModel.from_xml_string(DELAYED), DATA)
+        make_room_for_delays(None, mujoco.MjModel.from_xml_string(DELAYED), DATA)
     plain = mujoco.MjModel.from_xml_string(DELAYED.replace('delay="0.02" nsample="5"', ""))
-    assert with_room(None, plain, DATA) is plain
+    assert make_room_for_delays(None, plain, DATA) is plain

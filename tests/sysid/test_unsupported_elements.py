@@ -10,7 +10,7 @@ from simulated import PENDULUM, briefly, compiled, recorded
 from sb3_rpto.sysid import Measurements
 from sb3_rpto.sysid.data.signal_quality import Finding, listed
 from sb3_rpto.sysid.problem.data_model_consistency import check_against, soft_ties
-from sb3_rpto.sysid.problem.unsupported_elements import Hint, instead, mocap_bodies, unreached
+from sb3_rpto.sysid.problem.unsupported_elements import Hint, mocap_bodies, unreached, weigh_hints
 
 LINK = '<geom type="capsule" size=".03" fromto="0 0 0 0 0 -.3" mass="1" contype="0" conaffinity="0"/>'
 HINGE = '<joint name="hinge" axis="0 1 0" damping=".05" armature=".01"/>'
@@ -109,7 +109,7 @@ def test_what_nothing_acts_on_is_listed(xml: str, named: list[str]) -> None:
     said = [str(thing) for thing in unreached(model)]
     assert len(said) == len(named)
     assert all(one.startswith(start) for one, start in zip(said, named))
-    findings = instead(model, [], ratio=10.0)
+    findings = weigh_hints(model, [], ratio=10.0)
     assert [f.kind for f in findings] == ["beyond the library"] * bool(named)
     for name in named:
         assert name.split(" of ")[0].split(" '")[0] in findings[0].message
@@ -134,13 +134,13 @@ def test_a_hint_is_withheld_beside_what_nothing_acts_on_unless_it_leaves_nothing
         (None, 0.03, True),
     ):
         hint = Hint("undeclared mass", "arm", "declare arm.mass", bodies=bodies, left=left)
-        found = instead(model, [hint], ratio=37.0)
+        found = weigh_hints(model, [hint], ratio=37.0)
         assert (hint in found) == told
         assert ("beyond the library" in [f.kind for f in found]) == (bodies == toy or not told)
     other = Finding("time step", "the model", "errs less in finer steps")
-    assert other in instead(model, [other], ratio=37.0)
+    assert other in weigh_hints(model, [other], ratio=37.0)
     plain = Hint("undeclared mass", "pole", "declare pole.mass", bodies=frozenset({1}), left=0.36)
-    assert instead(compiled(), [plain], ratio=37.0) == [plain]
+    assert weigh_hints(compiled(), [plain], ratio=37.0) == [plain]
 
 
 @pytest.mark.parametrize(

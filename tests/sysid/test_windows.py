@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sb3_rpto.sysid.problem.prepare import at_rest
 from simulated import PENDULUM, compiled, recorded
 
 from sb3_rpto.effects import Drive, Simulation
 from sb3_rpto.effects.commands import Backlash
 from sb3_rpto.effects.names import object_id
 from sb3_rpto.sysid import Measurements
+from sb3_rpto.sysid.problem.problem import columns_at_rest
 from sb3_rpto.sysid.shooting.multiple_shooting import interpolate
 from sb3_rpto.sysid.shooting.windows import ENOUGH_BLOCKS, EXACT, REVERSALS, cut, discretised, noise_levels, reversals
 
@@ -82,11 +82,11 @@ def test_runs_in_which_a_joint_rests_do_not_say_how_it_is_rounded() -> None:
 def test_positions_that_never_change_are_not_compared() -> None:
     moving, still = 0.1 * np.sin(np.arange(100) / 5), np.full(100, 0.3)
     table = {"time": np.arange(100) * 0.01, "qpos.a": moving, "qpos.b": still}
-    assert at_rest(Measurements.from_tables({"run": table})) == ["b"]
-    assert at_rest(Measurements.from_tables({"run": table, "other": table | {"qpos.b": still + 1e-3}})) == []
+    assert columns_at_rest(Measurements.from_tables({"run": table})) == ["b"]
+    assert columns_at_rest(Measurements.from_tables({"run": table, "other": table | {"qpos.b": still + 1e-3}})) == []
     with pytest.raises(ValueError, match=r"no position changes .*\('qpos.a', 'qpos.b'\): a dead sensor"):
-        at_rest(Measurements.from_tables({"run": table | {"qpos.a": still}}))
-    assert at_rest(replace(Measurements.from_tables({"run": table}), exact=True)) == []
+        columns_at_rest(Measurements.from_tables({"run": table | {"qpos.a": still}}))
+    assert columns_at_rest(replace(Measurements.from_tables({"run": table}), exact=True)) == []
 
 
 def test_exact_data_have_a_fixed_small_share_of_their_spread_as_noise() -> None:

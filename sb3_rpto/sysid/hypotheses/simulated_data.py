@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sb3_rpto.sysid.data.signal_quality import Finding
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis, kept_effects
-from sb3_rpto.sysid.problem.data_origin import may_be_exact, met_exactly, origin
+from sb3_rpto.sysid.problem.data_origin import are_exact_states, find_origin, may_be_exact
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.selection.search import SearchResult
 
@@ -49,7 +49,7 @@ class SimulatorSteps(Hypothesis):
             return False
         asked, known = problem.inputs, kept_effects(result)
         parameters = (asked.declared, problem.sigma, problem.length, asked.threads, known, problem.settings)
-        return origin(problem.nominal, problem.fitted, *parameters) != "machine"
+        return find_origin(problem.nominal, problem.fitted, *parameters) != "machine"
 
     def alternative(self, problem: IdentificationProblem, result: SearchResult) -> IdentificationProblem:
         """The recordings read in the model's own steps."""
@@ -79,7 +79,7 @@ class ExactStates(Hypothesis):
             return True
         asked = problem.inputs
         parameters = (asked.declared, problem.length, asked.threads, kept_effects(result), problem.settings)
-        return met_exactly(problem.nominal, problem.fitted, *parameters)
+        return are_exact_states(problem.nominal, problem.fitted, *parameters)
 
     def alternative(self, problem: IdentificationProblem, result: SearchResult) -> IdentificationProblem:
         """The recordings read as exact states."""

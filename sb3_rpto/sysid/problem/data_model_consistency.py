@@ -22,7 +22,7 @@ from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.signal_quality import Finding, smoothed_velocity
 from sb3_rpto.sysid.problem.unsupported_elements import Hint, mocap_bodies, moved_by_mocap, of_actuator
 from sb3_rpto.sysid.settings import DEFAULTS, ConsistencySettings, Settings
-from sb3_rpto.sysid.shooting.windows import command_order, discretised, stiff
+from sb3_rpto.sysid.shooting.windows import command_order, discretised, is_stiff
 
 ALL = "all episodes"
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # the first of the scalar ones
@@ -198,7 +198,7 @@ def _sampling(model: mujoco.MjModel, data: Measurements, settings: Settings) -> 
             f"one of {step / max(1, np.ceil(step / timestep)):.6g} s would be"
         )
         found.append(Finding("sampling", f"{ALL}, time", message))
-    if not (data.exact or data.simulated) and stiff(discretised(model, data, fine=False, settings=settings.problem)):
+    if not (data.exact or data.simulated) and is_stiff(discretised(model, data, fine=False, settings=settings.problem)):
         message = "too stiff for the Runge-Kutta method at this timestep: integrated implicitly, less finely"
         found.append(Finding("stiff model", "the model", message))
     if step > 1.01 * settings.consistency.slow_step and not data.exact:
@@ -234,7 +234,7 @@ def _clipped(model: mujoco.MjModel, data: Measurements, settings: ConsistencySet
     return found
 
 
-def doubts(model: mujoco.MjModel, data: Measurements) -> list[Hint]:
+def unlikely_columns(model: mujoco.MjModel, data: Measurements) -> list[Hint]:
     """What may be wrong where nothing explains recordings: angles in degrees, constant commands, limits of motors."""
     found: list[Hint] = []
     for name, turns in large_angles(model, data).items():

@@ -31,7 +31,7 @@ def may_be_exact(data: Measurements, slow: float = DEFAULTS.consistency.slow_ste
     return not (data.whole_states or data.columns.missing or data.unobserved) and bool(step >= slow)
 
 
-def idle(
+def begins_idle(
     simulation: Simulation, data: Measurements, sigma: np.ndarray, settings: OriginSettings = DEFAULTS.origin
 ) -> bool:
     """Whether runs of a simulator seem to begin without a command: not all of the first one acts in the first step.
@@ -67,7 +67,7 @@ def idle(
     return arrives + settings.arriving_deviations / float(np.sqrt(known.sum())) < settings.arriving_share
 
 
-def origin(
+def find_origin(
     model: mujoco.MjModel,
     data: Measurements,
     declared: Sequence[str],
@@ -106,11 +106,13 @@ def origin(
         return "machine"
     noiseless = bool(np.all(sigma < limits.noiseless * noise_levels(replace(data, exact=True, noise=None))))
     return (
-        "exact" if noiseless and met_exactly(model, data, declared, horizon, threads, known, settings) else "simulated"
+        "exact"
+        if noiseless and are_exact_states(model, data, declared, horizon, threads, known, settings)
+        else "simulated"
     )
 
 
-def met_exactly(
+def are_exact_states(
     model: mujoco.MjModel,
     data: Measurements,
     declared: Sequence[str],
@@ -121,7 +123,7 @@ def met_exactly(
 ) -> bool:
     """Whether the model's own steps lead from the states of recordings to those after them, but for rounding.
 
-    Parameters as of :func:`origin`.
+    Parameters as of :func:`find_origin`.
     """
     exact = replace(data, exact=True, noise=None)
     error = _error(model, exact, noise_levels(exact), declared, horizon, threads, known, settings)

@@ -28,7 +28,7 @@ from sb3_rpto.sysid.data.sample_clock import settle_clock
 from sb3_rpto.sysid.data.signal_quality import Finding
 from sb3_rpto.sysid.problem.contacts import contact_changes
 from sb3_rpto.sysid.problem.data_model_consistency import carried_weights, check_against, soft_friction, soft_ties
-from sb3_rpto.sysid.problem.data_origin import idle, origin
+from sb3_rpto.sysid.problem.data_origin import begins_idle, find_origin
 from sb3_rpto.sysid.problem.inverse_dynamics import force_residuals, typical
 from sb3_rpto.sysid.settings import DEFAULTS, ProblemSettings, Settings
 from sb3_rpto.sysid.shooting.windows import BLOCK, MEMORY, Windows, cut, discretised, noise_levels, step_for
@@ -268,12 +268,12 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
     checked = check_against(compiled, data, inputs.settings)
     findings = [*data.findings, *turned, *clock, *checked, *_own_step(inputs.model)]
     given(compiled, declared, known)  # what is wrong there is said before the work
-    roomy = with_room(spec, compiled, data, settings)
+    roomy = make_room_for_delays(spec, compiled, data, settings)
     parts = data.split(inputs.seed)
     split = Split(*(part.episodes for part in parts))
     findings += [f for f in parts[0].findings if f not in findings]
     fitted = replace(data, episodes=[*split.train, *split.select])
-    resting = at_rest(fitted)
+    resting = columns_at_rest(fitted)
     if resting:
         data, fitted = (replace(d, unobserved=(*d.unobserved, *resting)) for d in (data, fitted))
         message = "never changes, so nothing tells how finely it is measured: it is not compared with predictions"
@@ -287,7 +287,7 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
         findings.append(Finding("contacts", "fitted runs", message))
     # What was told need not be found out.
     asked = (declared, sigma, length, threads, known, inputs.settings)
-    seems = "told" if data.simulated else origin(roomy, fitted, *asked)
+    seems = "told" if data.simulated else find_origin(roomy, fitted, *asked)
     if seems in ("simulated", "exact"):
         exact = seems == "exact"
         data = replace(data, simulated=True, exact=exact, noise=None if exact else data.noise)
@@ -306,7 +306,7 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
     effects = _effects(nominal, data, there, kinds)
     findings += _without_a_place(nominal, kinds)
     fine = Simulation(nominal, effects, threads)
-    if (data.exact or data.simulated) and idle(fine, fitted, sigma, inputs.settings.origin):
+    if (data.exact or data.simulated) and begins_idle(fine, fitted, sigma, inputs.settings.origin):
         data = replace(data, idle=True)
     residuals = force_residuals(fine, fine.null, replace(data, episodes=fitted.episodes))
     scales = typical(fine, residuals).scales(fine.effects)
@@ -359,7 +359,7 @@ def _own_step(model: Any) -> list[Finding]:
     return [Finding("own step", "step() of the environment", message)]
 
 
-def with_room(
+def make_room_for_delays(
     spec: mujoco.MjSpec | None,
     compiled: mujoco.MjModel,
     data: Measurements,
@@ -403,7 +403,7 @@ def with_room(
     return roomy
 
 
-def at_rest(data: Measurements) -> list[str]:
+def columns_at_rest(data: Measurements) -> list[str]:
     """Measured positions that never change, by their columns' names; none where states are known whole.
 
     :param data: to fit to

@@ -71,7 +71,7 @@ def unreached(model: mujoco.MjModel) -> list[Thing]:
     return [thing for thing in things if any(model.body_treeid[b] >= 0 for b in thing.bodies)]
 
 
-def instead(
+def weigh_hints(
     model: mujoco.MjModel, hints: Sequence[Finding], ratio: float, small: float = DEFAULTS.adequacy.small
 ) -> list[Finding]:
     """What may be wrong where nothing explains recordings: what nothing acts on, or what the hints say.

@@ -16,7 +16,7 @@ from sb3_rpto.sysid.hypotheses.alternatives import hints
 from sb3_rpto.sysid.problem.inverse_dynamics import ForceResidual, learnable_share, summary
 from sb3_rpto.sysid.problem.missing_force import missing_forces
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
-from sb3_rpto.sysid.problem.unsupported_elements import instead
+from sb3_rpto.sysid.problem.unsupported_elements import weigh_hints
 from sb3_rpto.sysid.report import descriptions
 from sb3_rpto.sysid.report.diagnostics import (
     above_noise,
@@ -179,7 +179,9 @@ def _about_the_verdict(
             *(above_noise(after, floor, result.after.ratio, horizon) if problem.test.episodes else []),
             *own_steps(problem.nominal, simulation, fit.values, problem.fitted, sigma, horizon),
         ]
-    found = instead(problem.nominal, hints(problem, result, fit), result.after.ratio, problem.settings.adequacy.small)
+    found = weigh_hints(
+        problem.nominal, hints(problem, result, fit), result.after.ratio, problem.settings.adequacy.small
+    )
     return [*found, *(no_nearer(predictions.before, predictions.after) if fit.named else [])]
 
 

@@ -292,7 +292,7 @@ def tied_sensors(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Finding
 
 
 def idle_start(late: Sequence[Effect]) -> list[Finding]:
-    """What is late acts on zeros when a run begins, see :func:`sb3_rpto.sysid.problem.data_origin.idle`.
+    """What is late acts on zeros when a run begins, see :func:`sb3_rpto.sysid.problem.data_origin.begins_idle`.
 
     :param late: effects that are so
     """

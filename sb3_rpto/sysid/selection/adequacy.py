@@ -49,7 +49,7 @@ class Adequacy:
         return f"R = {self.ratio:.2f} [{self.low:.2f}, {self.high:.2f}]"
 
 
-def counted_with(select: Adequacy, few: int, fitted: Adequacy, more: int) -> Adequacy:
+def count_strays_with(select: Adequacy, few: int, fitted: Adequacy, more: int) -> Adequacy:
     """The same, with the stray windows of a fit counted among those of a few that it was not made to.
 
     A robust fit gives up what it cannot reach: of few windows too few are of that to deny that it is all.

@@ -10,7 +10,7 @@ import numpy as np
 from sb3_rpto.effects import Effect, Simulation
 from sb3_rpto.fitting.loss import FAR
 from sb3_rpto.sysid.problem.problem import IdentificationProblem, Progress, silent
-from sb3_rpto.sysid.selection.adequacy import SETTLED, Adequacy, adequacy, counted_with, judge
+from sb3_rpto.sysid.selection.adequacy import SETTLED, Adequacy, adequacy, count_strays_with, judge
 from sb3_rpto.sysid.selection.model_comparison import Evidence, compare
 from sb3_rpto.sysid.selection.screening import Screening, screen
 from sb3_rpto.sysid.selection.stepwise_selection import Model, Selection, Selector
@@ -423,7 +423,7 @@ def assess(selector: Selector, model: Model, seed: int) -> Adequacy:
     count, train = len(selector.select.windows), selector.train
     fitted = adequacy(train, train.score(values, iterations=START_STEPS), seed, settings.adequacy)
     few = count < settings.selection.few_windows
-    return counted_with(seen, count, fitted, len(train.windows)) if few or fitted.spread else seen
+    return count_strays_with(seen, count, fitted, len(train.windows)) if few or fitted.spread else seen
 
 
 # --- a few kinds, each at all its places ------------------------------------------------------------------------------

@@ -174,7 +174,7 @@ def discretised(
         copy.opt.timestep /= data.substeps
     else:
         copy.opt.timestep = step_for(model, data, settings)
-        if fine and stiff(copy):
+        if fine and is_stiff(copy):
             copy.opt.integrator = int(_IMPLICIT.get(model.opt.integrator, _FAST))
         elif fine:
             copy.opt.integrator = int(mujoco.mjtIntegrator.mjINT_RK4)
@@ -194,7 +194,7 @@ _FAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 _IMPLICIT = {int(i): i for i in (_FAST, mujoco.mjtIntegrator.mjINT_IMPLICIT)}
 
 
-def stiff(model: mujoco.MjModel) -> bool:
+def is_stiff(model: mujoco.MjModel) -> bool:
     """Whether the Runge-Kutta method would be unstable at the model's time step, near its reference pose.
 
     Looked at are the eigenvalues of the motion without contacts, limits and dry friction, linearised by differences.
