@@ -105,11 +105,8 @@ def find_origin(
     if own > (limits.share_where_enough if own < limits.enough else limits.clear_share) * continuous:
         return "machine"
     noiseless = bool(np.all(sigma < limits.noiseless * noise_levels(replace(data, exact=True, noise=None))))
-    return (
-        "exact"
-        if noiseless and are_exact_states(model, data, declared, horizon, threads, known, settings)
-        else "simulated"
-    )
+    exact = noiseless and are_exact_states(model, data, declared, horizon, threads, known, settings)
+    return "exact" if exact else "simulated"
 
 
 def are_exact_states(

@@ -257,64 +257,88 @@ def prepare(inputs: Inputs, assumptions: Assumptions = Assumptions()) -> Identif
     """
     declared, known, threads, settings = inputs.declared, inputs.known, inputs.threads, inputs.settings.problem
     spec, compiled = load_model(inputs.model)
-    data = replace(
-        inputs.data,
-        exact=inputs.data.exact or assumptions.exact,
-        simulated=inputs.data.simulated or assumptions.simulated,
-        substeps=inputs.data.substeps if assumptions.substeps == 1 else assumptions.substeps,
-    )
-    data, turned = settle_turns(compiled, data)
-    data, clock = settle_clock(data)
-    checked = check_against(compiled, data, inputs.settings)
-    findings = [*data.findings, *turned, *clock, *checked, *_own_step(inputs.model)]
+    data, findings = _check(inputs, assumptions, compiled)
     given(compiled, declared, known)  # what is wrong there is said before the work
     roomy = make_room_for_delays(spec, compiled, data, settings)
-    parts = data.split(inputs.seed)
-    split = Split(*(part.episodes for part in parts))
-    findings += [f for f in parts[0].findings if f not in findings]
-    fitted = replace(data, episodes=[*split.train, *split.select])
-    resting = columns_at_rest(fitted)
-    if resting:
-        data, fitted = (replace(d, unobserved=(*d.unobserved, *resting)) for d in (data, fitted))
-        message = "never changes, so nothing tells how finely it is measured: it is not compared with predictions"
-        findings += [Finding("at rest", f"fitted runs, qpos.{name}", message) for name in resting]
+    data, split = _part(data, inputs.seed, findings)
+    runs = [*split.train, *split.select]
+    fitted = replace(data, episodes=runs)
     sigma = noise_levels(fitted)
-    changes = contact_changes(compiled, fitted, sigma)
-    touching = changes > settings.contact_changes
-    length = _horizon(fitted, touching, settings) if inputs.horizon is None else float(inputs.horizon)
-    if touching and inputs.horizon is None:
-        message = f"{changes:.1f} a second come or go; windows of {length:.2g} s, as errors about a touch-down grow"
-        findings.append(Finding("contacts", "fitted runs", message))
+    length, touching = _length(inputs, compiled, fitted, sigma, findings)
     # What was told need not be found out.
     asked = (declared, sigma, length, threads, known, inputs.settings)
     seems = "told" if data.simulated else find_origin(roomy, fitted, *asked)
     if seems in ("simulated", "exact"):
-        exact = seems == "exact"
-        data = replace(data, simulated=True, exact=exact, noise=None if exact else data.noise)
-        sigma = noise_levels(replace(data, episodes=fitted.episodes))
-        noise = "without noise" if exact else "with noise"
-        message = f"from the model's own steps in time, {noise}: they meet them better than the continuous motion does"
-        findings.append(Finding("simulated", "fitted runs", message))
+        data = _of_a_simulator(data, seems == "exact", findings)
+        sigma = noise_levels(replace(data, episodes=runs))
     data = replace(data, touching=touching and not data.exact)  # those are met, or fits begin anew until they are
-    fitted = replace(data, episodes=fitted.episodes)
+    fitted = replace(data, episodes=runs)
     nominal = discretised(roomy, fitted, fine=True, settings=settings)
-    there = given(nominal, declared, known, assumptions.soft_friction)
     if seems == "machine" and not data.exact:
         soft = inputs.settings.consistency.soft
         findings += soft_friction(nominal, soft) + soft_ties(nominal, soft) + carried_weights(nominal)
     kinds = inputs.candidates if assumptions.kinds is None else assumptions.kinds
-    effects = _effects(nominal, data, there, kinds)
+    effects = _effects(nominal, data, given(nominal, declared, known, assumptions.soft_friction), kinds)
     findings += _without_a_place(nominal, kinds)
     fine = Simulation(nominal, effects, threads)
     if (data.exact or data.simulated) and begins_idle(fine, fitted, sigma, inputs.settings.origin):
         data = replace(data, idle=True)
-    residuals = force_residuals(fine, fine.null, replace(data, episodes=fitted.episodes))
+    residuals = force_residuals(fine, fine.null, replace(data, episodes=runs))
     scales = typical(fine, residuals).scales(fine.effects)
     rough = Simulation(discretised(roomy, fitted, fine=False, settings=settings), effects, threads)
     problem = IdentificationProblem(
         inputs, assumptions, spec, compiled, findings, data, split, sigma, fine, rough, scales, length
     )
     return replace(problem, longer=problem.longer_horizon()) if inputs.horizon is None else problem
+
+
+def _check(inputs: Inputs, assumptions: Assumptions, model: mujoco.MjModel) -> tuple[Measurements, list[Finding]]:
+    """The recordings as they are assumed to be, repaired and checked against the model, and what was found."""
+    data = replace(
+        inputs.data,
+        exact=inputs.data.exact or assumptions.exact,
+        simulated=inputs.data.simulated or assumptions.simulated,
+        substeps=inputs.data.substeps if assumptions.substeps == 1 else assumptions.substeps,
+    )
+    data, turned = settle_turns(model, data)
+    data, clock = settle_clock(data)
+    checked = check_against(model, data, inputs.settings)
+    return data, [*data.findings, *turned, *clock, *checked, *_own_step(inputs.model)]
+
+
+def _part(data: Measurements, seed: int, findings: list[Finding]) -> tuple[Measurements, Split]:
+    """The recordings without columns that never change, and their parts; what is found joins the findings."""
+    parts = data.split(seed)
+    split = Split(*(part.episodes for part in parts))
+    findings += [f for f in parts[0].findings if f not in findings]
+    resting = columns_at_rest(replace(data, episodes=[*split.train, *split.select]))
+    message = "never changes, so nothing tells how finely it is measured: it is not compared with predictions"
+    findings += [Finding("at rest", f"fitted runs, qpos.{name}", message) for name in resting]
+    return replace(data, unobserved=(*data.unobserved, *resting)), split
+
+
+def _length(
+    inputs: Inputs, model: mujoco.MjModel, fitted: Measurements, sigma: np.ndarray, findings: list[Finding]
+) -> tuple[float, bool]:
+    """Length of the windows in s, and whether contacts come and go, which joins the findings."""
+    settings = inputs.settings.problem
+    changes = contact_changes(model, fitted, sigma)
+    touching = changes > settings.contact_changes
+    if inputs.horizon is not None:
+        return float(inputs.horizon), touching
+    length = _horizon(fitted, touching, settings)
+    if touching:
+        message = f"{changes:.1f} a second come or go; windows of {length:.2g} s, as errors about a touch-down grow"
+        findings.append(Finding("contacts", "fitted runs", message))
+    return length, touching
+
+
+def _of_a_simulator(data: Measurements, exact: bool, findings: list[Finding]) -> Measurements:
+    """The recordings as a simulator's own, with noise or ``exact``; that joins the findings."""
+    noise = "without noise" if exact else "with noise"
+    message = f"from the model's own steps in time, {noise}: they meet them better than the continuous motion does"
+    findings.append(Finding("simulated", "fitted runs", message))
+    return replace(data, simulated=True, exact=exact, noise=None if exact else data.noise)
 
 
 def _effects(

@@ -179,9 +179,8 @@ def _about_the_verdict(
             *(above_noise(after, floor, result.after.ratio, horizon) if problem.test.episodes else []),
             *own_steps(problem.nominal, simulation, fit.values, problem.fitted, sigma, horizon),
         ]
-    found = weigh_hints(
-        problem.nominal, hints(problem, result, fit), result.after.ratio, problem.settings.adequacy.small
-    )
+    small = problem.settings.adequacy.small
+    found = weigh_hints(problem.nominal, hints(problem, result, fit), result.after.ratio, small)
     return [*found, *(no_nearer(predictions.before, predictions.after) if fit.named else [])]
 
 
