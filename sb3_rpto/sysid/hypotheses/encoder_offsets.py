@@ -62,7 +62,7 @@ class OffsetsOfRuns(Hypothesis):
 
     def finding(self, alternative: IdentificationProblem, result: SearchResult) -> Finding | None:
         """The offsets."""
-        return alternative.offsets and alternative.offsets.finding()
+        return None if alternative.offsets is None else alternative.offsets.finding()
 
 
 class ProblemWithOffsets(Problem):

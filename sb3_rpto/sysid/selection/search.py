@@ -45,8 +45,10 @@ class SelectorPair:
 
         def select(simulation: Simulation) -> Selector:
             train, judging = problem.windows(simulation, horizon)
-            parts = Problem(simulation, train, problem.scales), judging and Problem(simulation, judging, problem.scales)
-            return Selector(*parts, lambda share, what: say(0.2 + 0.5 * share, what), horizon, thresholds)
+            scales = problem.scales
+            to_fit = Problem(simulation, train, scales)
+            to_judge = None if judging is None else Problem(simulation, judging, scales)
+            return Selector(to_fit, to_judge, lambda share, what: say(0.2 + 0.5 * share, what), horizon, thresholds)
 
         say, thresholds = problem.inputs.say, settings or problem.settings
         fine = select(problem.fine)
@@ -512,8 +514,8 @@ def _one_more(selector: Selector, model: Model) -> Model | None:
     error, e, values = min(tried, key=lambda one: one[0], default=(np.inf, 0, model.fit.values))
     if error > (1 - settings.gain_far) * typical(model.fit.errors[some]):
         return None
-    begin = replace(model.fit, values=values, linear=None)
-    trial = selector.refine(selector.fit_model_from([*{*model.effects, e}], begin, settings.joint_iterations))
+    there = replace(model.fit, values=values, linear=None)
+    trial = selector.refine(selector.fit_model_from([*{*model.effects, e}], there, settings.joint_iterations))
     return trial if np.sum(trial.fit.errors > limit) < len(missed) else None
 
 
