@@ -22,6 +22,7 @@ from sb3_rpto.sysid.report.diagnostics import (
     own_steps,
     tied_sensors,
 )
+from sb3_rpto.sysid.settings import DEFAULTS
 from sb3_rpto.sysid.shooting.multiple_shooting import Problem
 from sb3_rpto.sysid.shooting.prediction_errors import HorizonError, horizon_errors, noise_floor
 from sb3_rpto.sysid.shooting.windows import cut, discretised, noise_levels
@@ -121,7 +122,7 @@ def test_transitions_of_finer_steps_than_the_models_are_told(step: float, told: 
     problem = Problem(own, cut(model, data, noise_levels(data), 0.16, 20), [])
 
     def hints(data: Measurements) -> list[Finding]:
-        task: Any = SimpleNamespace(fitted=data)
+        task: Any = SimpleNamespace(fitted=data, settings=DEFAULTS)
         fit: Any = SimpleNamespace(problem=problem, values=own.null, free=np.empty(0, dtype=int), horizon=0.16)
         return FinerSteps().hints(task, None, fit)  # type: ignore[arg-type]
 

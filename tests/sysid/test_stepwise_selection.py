@@ -187,7 +187,7 @@ def test_the_joint_fit_begins_again_from_kinds_that_do_no_better_alone(monkeypat
     ends = {0.0: fitted(0.1, 1.3, 20.0), 1.0: fitted(1.1, 1.0, 10.0)}
     monkeypatch.setattr(s, "_best_few", lambda *a: few)
     monkeypatch.setattr(s.train, "fit", lambda values, *a, **k: ends[values[0]])
-    monkeypatch.setattr(s, "model", lambda effects, begin: Model(tuple(effects), begin, begin.errors))
+    monkeypatch.setattr(s, "fit_model", lambda effects, begin: Model(tuple(effects), begin, begin.errors))
     model, _ = s.fit_together([COULOMB, OFFSET, DRAG], base, fitted(0.0, 2.0, 40.0))
     assert model.fit is ends[1.0]
 
