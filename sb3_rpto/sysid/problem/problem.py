@@ -149,11 +149,6 @@ class IdentificationProblem:
         """Thresholds."""
         return self.inputs.settings
 
-    @property
-    def kinds(self) -> Sequence[str] | None:
-        """Kinds of effects that are looked for; None: all that are offered."""
-        return self.inputs.candidates if self.assumptions.kinds is None else self.assumptions.kinds
-
     # --- the same, changed --------------------------------------------------------------------------------------
 
     def assuming(self, **changes: Any) -> IdentificationProblem:
