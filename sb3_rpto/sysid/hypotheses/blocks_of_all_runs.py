@@ -25,10 +25,6 @@ class BlocksOfAllRuns(Hypothesis):
         """The same with no run set apart to select on."""
         return problem.with_blocks_of_all_runs()
 
-    def accepts(self, result: SearchResult, alternative: SearchResult) -> bool:
-        """In any case."""
-        return True
-
     def finding(self, alternative: IdentificationProblem, result: SearchResult) -> Finding:
         """How the data are split."""
         message = (

@@ -55,10 +55,6 @@ class SimulatorSteps(Hypothesis):
         """The recordings read in the model's own steps."""
         return problem.assuming(simulated=True, **ANEW)
 
-    def accepts(self, result: SearchResult, alternative: SearchResult) -> bool:
-        """In any case."""
-        return True
-
     def finding(self, alternative: IdentificationProblem, result: SearchResult) -> Finding:
         """When that showed."""
         message = "from the model's own steps in time, as shows with what was found first; searched again in such steps"
