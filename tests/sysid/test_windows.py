@@ -145,8 +145,8 @@ def test_semi_implicit_steps_are_of_second_order_from_where_they_have_their_velo
 ) -> None:
     data = recorded(noise=0.0, duration=3.1)
     exact, found = predicted(data, "RK4"), predicted(data, integrator)
-    for module in ("starts", "windows"):
-        monkeypatch.setattr(f"sb3_rpto.sysid.{module}.half_step", lambda model: 0.0)
+    for module in ("initial_states", "windows"):
+        monkeypatch.setattr(f"sb3_rpto.sysid.shooting.{module}.half_step", lambda model: 0.0)
     first_order = np.abs(predicted(data, integrator) - exact)
     np.testing.assert_array_equal(predicted(data, "RK4"), exact)
     assert np.median(first_order) > 1e-3
