@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
-from sb3_rpto.dynamics.onestep import BLOWN, OneStep, Steps, as_steps
+from sb3_rpto.dynamics.onestep import BLOWN, OneStepError, Steps, as_steps
 from sb3_rpto.dynamics.simulator import check_memoryless
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.actuation import command_limits
@@ -39,8 +39,6 @@ RULES = {
     **dict.fromkeys(("declared", "effects"), of_type("be a list", list, tuple)),
 }
 
-#: A fit stops when no parameter moves by more than this share of its scale.
-STILL = 1e-6
 #: A simulator must stay finite for so many steps from states of the target, and below what MuJoCo takes for such.
 TRIAL_STATES, TRIAL_STEPS, LARGEST = 16, 20, mujoco.mjMAXVAL
 
@@ -125,8 +123,8 @@ class PhysicalDynamics(Dynamics):
             None if observation_noise is None else noise_of_each(observation_noise, recover, "observation_noise")
         )
         self._twin: CorrectedEnv | None = None
-        self._unseen: tuple[str, ...] = ()
-        self._entangled: tuple[str, ...] = ()
+        self._vague: tuple[str, ...] = ()
+        self._confounded: tuple[str, ...] = ()
         known: list[Effect] = [*declare(model, declared)]
         every = [*known, *map(from_json, effects)]
         labels = [effect.label for effect in every]
@@ -384,14 +382,8 @@ class PhysicalDynamics(Dynamics):
         if not steps.compared.any() or not len(self.names):
             return {"steps": 0.0, **counts}
         begin, most = self.values.copy(), self.max_steps if max_steps is None else max_steps
-        problem = OneStep(self.simulation, self.scale, self.simulation.lower, self.simulation.upper, steps, weights)
-        problem.hold_what_is_not_determined(begin)
-        values, taken = self._descend(problem, begin, most)
-        vague = problem.vague(values, begin)
-        while (values != begin)[vague].any():  # what the data do not tell has moved: without it, from the start
-            problem.left |= vague
-            values, taken = self._descend(problem, begin, most)
-            vague = problem.vague(values, begin)
+        error = OneStepError(self.simulation, self.scale, self.simulation.lower, self.simulation.upper, steps, weights)
+        values, taken = error.fit(begin, self.max_step, most)
         self._values.copy_(th.as_tensor(values))
         self.settled = taken < most
         if taken and not self.runs_on(data):
@@ -402,46 +394,33 @@ class PhysicalDynamics(Dynamics):
                 stacklevel=3,
             )
             return {"steps": 0.0, **counts}
-        problem.left |= vague
-        self._covariance.copy_(th.as_tensor(problem.covariance(values)))
-        self._name_unseen(problem.left)
-        self._name_entangled(problem.entangled, problem.held)
+        self._covariance.copy_(th.as_tensor(error.covariance(values)))
+        self._name_vague(error.vague)
+        self._name_confounded(error.confounded, error.fixed)
         return {"steps": float(taken), **counts}
 
-    def _descend(self, problem: OneStep, values: np.ndarray, most: int) -> tuple[np.ndarray, int]:
-        """At most ``most`` trusted steps from ``values`` on: where they lead, and how many they were."""
-        for taken in range(most):
-            moved = problem.step(values, self.max_step)
-            if moved is None:
-                return values, taken
-            change = float(np.max(np.abs(moved - values) / self.scale))
-            values = moved
-            if change < STILL:
-                return values, taken + 1
-        return values, most
-
-    def _name_unseen(self, unseen: np.ndarray) -> None:
+    def _name_vague(self, vague: np.ndarray) -> None:
         """Warn once of parameters that the data do not show, or too faintly."""
-        names = self._which(unseen)
+        names = self._which(vague)
         _warn_of_new(
             names,
-            self._unseen,
+            self._vague,
             f"the target's data do not show {', '.join(names)}: left at what it was; do not declare it, or move so "
             "that it matters",
         )
-        self._unseen = tuple(dict.fromkeys([*self._unseen, *names]))  # with more data they may come and go
+        self._vague = tuple(dict.fromkeys([*self._vague, *names]))  # with more data they may come and go
 
-    def _name_entangled(self, entangled: np.ndarray, held: np.ndarray) -> None:
+    def _name_confounded(self, confounded: np.ndarray, fixed: np.ndarray) -> None:
         """Warn once of parameters that the data do not tell apart."""
-        names = self._which(entangled)
+        names = self._which(confounded)
         _warn_of_new(
             names,
-            self._entangled,
-            f"the target's data do not tell {', '.join(names)} apart: {', '.join(self._which(held))} left at what it "
+            self._confounded,
+            f"the target's data do not tell {', '.join(names)} apart: {', '.join(self._which(fixed))} left at what it "
             "was, the rest is fitted to that and has no standard error; declare fewer of them, or add what is known of "
             "one",
         )
-        self._entangled = names
+        self._confounded = names
 
     def _which(self, marked: np.ndarray) -> tuple[str, ...]:
         return tuple(self.names[i] for i in np.flatnonzero(marked))
