@@ -25,7 +25,7 @@ from sb3_rpto.effects.model import ModelSource, load_model
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.effects.stance import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
-from sb3_rpto.envs.env_copy import copy_env
+from sb3_rpto.envs.env_copy import CopyError, must_copy
 from sb3_rpto.envs.observations import StateMap, are_known, env_name, noise_of_each, single_env, whole_state
 from sb3_rpto.envs.step_fidelity import place_as_after_a_step
 from sb3_rpto.ranges import NOT_NEGATIVE, POSITIVE, THREADS, check, of_type, whole
@@ -271,9 +271,10 @@ class PhysicalDynamics(Dynamics):
         :raises ValueError: it cannot be copied, or set to a state, or its answer to a step does not follow from the
             state before it
         """
-        twin = copy_env(single_env(env))
-        if twin is None:
-            raise ValueError(f"{env} cannot be copied; give dynamics='physical' an environment that can")
+        try:
+            twin = must_copy(single_env(env))
+        except CopyError as error:
+            raise ValueError(f"{env} cannot be copied ({error}), which dynamics='physical' needs") from error
         for name in ("set_state", "_get_obs"):
             if not callable(getattr(twin.unwrapped, name, None)):
                 raise ValueError(

@@ -217,9 +217,29 @@ class LiveWorld(World):
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         super().__init__(model, 1)
         self.data = data
-        self.qpos, self.qvel, self.ctrl = data.qpos[None], data.qvel[None], data.ctrl[None]
-        self.actuation = data.qfrc_actuator[None]
         self._numbers: dict[str, np.ndarray] = {}  # options that are plain numbers: written here, then to the model
+
+    # Views are taken when asked for: a copy of this has those of its own data.
+
+    @property
+    def qpos(self) -> np.ndarray:  # type: ignore[override]
+        """Positions, (1, nq), live."""
+        return np.asarray(self.data.qpos[None])
+
+    @property
+    def qvel(self) -> np.ndarray:  # type: ignore[override]
+        """Velocities, (1, nv), live."""
+        return np.asarray(self.data.qvel[None])
+
+    @property
+    def ctrl(self) -> np.ndarray:  # type: ignore[override]
+        """Commands, (1, nu), live."""
+        return np.asarray(self.data.ctrl[None])
+
+    @property
+    def actuation(self) -> np.ndarray:  # type: ignore[override]
+        """The actuators' generalised force at the last evaluate, (1, nv), live."""
+        return np.asarray(self.data.qfrc_actuator[None])
 
     @property
     def time(self) -> np.ndarray:  # type: ignore[override]

@@ -302,7 +302,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         if not isinstance(self.unwrapped, EzPickle):
             raise TypeError(
                 f"{type(self.unwrapped).__name__} is no EzPickle, so its pickle would hide what was written to its "
-                "model; derive it from gymnasium.utils.EzPickle (envs.copies.copy_env copies it in one process)"
+                "model; derive it from gymnasium.utils.EzPickle (envs.env_copy.copy_env copies it in one process)"
             )
         if self._covered:  # the outermost keeps the numbers for all
             return {"env": self.env, "effects": self.effects}

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
-from sb3_rpto.envs.env_copy import copy_env
+from sb3_rpto.envs.env_copy import EnvSource, make_env, must_copy
 
 #: What tasks keep beside the model that decides on resets and ends.
 _TASK = ("init_qpos", "init_qvel", "_healthy_z_range", "_healthy_angle_range", "_healthy_state_range")
@@ -51,20 +51,20 @@ class Difference:
         return "\n".join([*lines, f"{moves} from the same state under the same actions"])
 
 
-def differs(source: gym.Env | str, target: gym.Env | str, *, seed: int = 0, steps: int = 2_000) -> Difference:
+def differs(source: EnvSource, target: EnvSource, *, seed: int = 0, steps: int = 2_000) -> Difference:
     """Compare compiled models, and trajectories from the same states under the same actions.
 
     Random actions, each held for :data:`HELD` steps, go to copies of both until the first answer (observation, reward
     or termination) that differs by a bit; after an episode that ended in both, another begins. Where a MuJoCo task
     starts otherwise, which is told apart, the target is put where the source starts.
 
-    :param source: an environment or its id
+    :param source: an environment, its id, or a function that makes it
     :param target: likewise
     :param seed: of the resets and the actions
     :param steps: compared at most
     :raises ValueError: spaces that differ, or an environment that cannot be copied
     """
-    one, other = _copy(source), _copy(target)
+    one, other = must_copy(make_env(source, "source")), must_copy(make_env(target, "target"))
     space = one.action_space
     if space != other.action_space or one.observation_space != other.observation_space:
         raise ValueError("source and target have different spaces, so there are no same actions")
@@ -73,13 +73,6 @@ def differs(source: gym.Env | str, target: gym.Env | str, *, seed: int = 0, step
     task = tuple(name for name in _TASK if not _equal(mine.get(name), theirs.get(name)))
     effects = tuple(sorted(_effects(one) ^ _effects(other)))
     return Difference(_numbers(one.unwrapped, other.unwrapped), task, effects, start, step, steps)
-
-
-def _copy(env: gym.Env | str) -> gym.Env:
-    copy = copy_env(gym.make(env) if isinstance(env, str) else env)
-    if copy is None:
-        raise ValueError(f"{env} holds what cannot be copied; compare environments as gym.make gives them")
-    return copy
 
 
 def _first_difference(one: gym.Env, other: gym.Env, seed: int, steps: int) -> tuple[bool, int | None]:

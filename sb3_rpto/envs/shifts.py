@@ -13,7 +13,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
 from sb3_rpto.envs.differences import Difference, differs
-from sb3_rpto.envs.env_copy import copy_env
+from sb3_rpto.envs.env_copy import CopyError, must_copy
 
 if TYPE_CHECKING:  # MuJoCo is needed for MuJoCo's tasks alone
     from sb3_rpto.effects import Effect
@@ -85,10 +85,10 @@ class EnvShift:
         """
         if not isinstance(env, gym.Env):
             raise TypeError(f"env must be a gymnasium environment, not {type(env).__name__}; shift each one before")
-        twin = copy_env(env)
-        if twin is None:
-            raise ValueError(f"{env} holds what cannot be copied; make a new one and use shift.wrap(gym.make(...))")
-        return self.wrap(twin)
+        try:
+            return self.wrap(must_copy(env))
+        except CopyError as error:
+            raise ValueError(f"{env} cannot be copied ({error}); or use shift.wrap(gym.make(...))") from error
 
     def wrap(self, env: gym.Env) -> gym.Env:
         """``env`` itself, shifted: its innermost environment has the target's numbers from now on.
