@@ -23,7 +23,7 @@ from sb3_rpto.effects.effect import from_json
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.model import ModelSource, load_model
 from sb3_rpto.effects.simulation import Drive
-from sb3_rpto.effects.stance import StandingEnv
+from sb3_rpto.effects.walker_reset import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.env_copy import CopyError, must_copy
 from sb3_rpto.envs.observations import StateMap, are_known, env_name, noise_of_each, single_env, whole_state
@@ -62,7 +62,7 @@ class PhysicalDynamics(Dynamics):
 
     :param observation_space: the environment's
     :param action_space: the environment's; actions are the commands of the actuators
-    :param model: the simulator's model: the path or text of an MJCF, or as :func:`sb3_rpto.effects.model.load_model`
+    :param mj_model: the simulator's model: the path or text of an MJCF, or as :func:`sb3_rpto.effects.model.load_model`
         takes it
     :param recover: states from observations, see :func:`sb3_rpto.envs.observations.state_map`; None: observations are
         states, qpos and then qvel, NaN where one is not known
@@ -92,7 +92,7 @@ class PhysicalDynamics(Dynamics):
         observation_space: spaces.Box,
         action_space: spaces.Box,
         *,
-        model: ModelSource | PlainModel,
+        mj_model: ModelSource | PlainModel,
         recover: StateMap | None = None,
         frame_skip: int = 1,
         declared: Sequence[str] = (),
@@ -105,7 +105,7 @@ class PhysicalDynamics(Dynamics):
     ) -> None:
         super().__init__(observation_space, action_space)
         check(RULES, locals())
-        model = model.compile() if isinstance(model, PlainModel) else load_model(model)[1]
+        model = mj_model.compile() if isinstance(mj_model, PlainModel) else load_model(mj_model)[1]
         recover = whole_state(model.nq, model.nv) if recover is None else recover
         if action_space.shape != (model.nu,):
             raise ValueError(f"action_space has shape {action_space.shape}, the model {model.nu} actuators")
@@ -114,7 +114,7 @@ class PhysicalDynamics(Dynamics):
                 f"observation_space has shape {observation_space.shape}, and states are recovered from {recover.width} "
                 "numbers; give recover= for observations that are not qpos and qvel"
             )
-        self.model, self.recover, self.frame_skip = model, recover, frame_skip
+        self.mj_model, self.recover, self.frame_skip = model, recover, frame_skip
         self.max_step, self.max_steps, self.randomise = max_step, max_steps, randomise
         self.threads = threads
         #: whether the last fit came to its end, or phi would have moved on with more steps
@@ -135,9 +135,9 @@ class PhysicalDynamics(Dynamics):
 
     def _adopt(self, effects: Sequence[Effect], covariance: np.ndarray | None = None) -> None:
         """Let phi be the values of these effects, with their covariance (p, p); None: all zero."""
-        self.simulation = Simulation(self.model, effects, self.threads)
-        largest = np.abs(self.model.actuator_ctrlrange).max(axis=1, initial=0)[self.model.actuator_ctrladr]
-        gears = np.abs(self.model.actuator_gear[:, 0]) * largest
+        self.simulation = Simulation(self.mj_model, effects, self.threads)
+        largest = np.abs(self.mj_model.actuator_ctrlrange).max(axis=1, initial=0)[self.mj_model.actuator_ctrladr]
+        gears = np.abs(self.mj_model.actuator_gear[:, 0]) * largest
         strongest = float(gears.max(initial=0.0))
         scales = Scales(torque=strongest if strongest > 0 else 1.0)
         parameters = [p for e in self.simulation.effects for p in e.parameters]
@@ -216,7 +216,9 @@ class PhysicalDynamics(Dynamics):
         :param actions: of the transitions from there on, (n, length, nu)
         """
         states = self.recover(observations.astype(np.float64))
-        commands = np.repeat(np.clip(actions.astype(np.float64), *command_limits(self.model)), self.frame_skip, axis=1)
+        commands = np.repeat(
+            np.clip(actions.astype(np.float64), *command_limits(self.mj_model)), self.frame_skip, axis=1
+        )
         qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
         values = np.tile(self.values, (len(observations), 1))
         self.simulation.undo_sensors(values, qpos, qvel)
@@ -356,7 +358,7 @@ class PhysicalDynamics(Dynamics):
 
     def _steps(self, data: Transitions, chosen: np.ndarray | None = None) -> Steps:
         idle = any(effect.idle for effect in self.simulation.effects)
-        return as_steps(data, self.recover, self.model, self.frame_skip, chosen, idle)
+        return as_steps(data, self.recover, self.mj_model, self.frame_skip, chosen, idle)
 
     # ------------------------------------------------------------------ the fit
 

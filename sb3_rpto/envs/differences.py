@@ -8,6 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sb3_rpto.effects.model_numbers import differing, numbers
+from sb3_rpto.effects.names import object_names
+from sb3_rpto.effects.wrapper import beyond_model
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
 from sb3_rpto.envs.env_copy import EnvSource, make_env, must_copy
 
@@ -112,8 +115,6 @@ def _task(env: gym.Env) -> dict[str, Any]:
 def _effects(env: gym.Env) -> set[str]:
     if not hasattr(env.unwrapped, "model"):
         return set()
-    from sb3_rpto.effects.wrapper import beyond_model
-
     return set(beyond_model(env))
 
 
@@ -124,8 +125,6 @@ def _numbers(one: Any, other: Any) -> dict[str, tuple[str, ...]]:
         return {name: () for name in mine if mine[name] != theirs[name]}
     if not hasattr(one, "model"):
         return {}
-    from sb3_rpto.effects.model import differing, numbers
-
     mine, theirs = numbers(one.model), numbers(other.model)
     return {
         name: _objects(one.model, name, mine[name] != theirs[name])
@@ -137,8 +136,6 @@ def _numbers(one: Any, other: Any) -> dict[str, tuple[str, ...]]:
 
 def _objects(model: Any, name: str, unequal: np.ndarray) -> tuple[str, ...]:
     """Names of the objects whose rows of a field are unequal; none for a field of the whole model."""
-    from sb3_rpto.effects.names import object_names
-
     kind = {"body": "body", "geom": "geom", "jnt": "joint", "dof": "joint", "actuator": "actuator"}.get(
         name.partition("_")[0]
     )

@@ -6,14 +6,17 @@ import io
 import pickle
 import types
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, TypeAlias
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from gymnasium import wrappers
 from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_rpto.effects.wrapper import with_numbers
 from sb3_rpto.envs.observations import layers
 
 #: Wrappers that only draw or film.
@@ -23,7 +26,7 @@ _WINDOWS = ("pygame", "gymnasium.envs.mujoco.mujoco_rendering")
 #: What a function may hold that is shared with a copy.
 _PLAIN = (str, bytes, int, float, complex, np.generic, np.ndarray, type, types.ModuleType, type(None))
 #: Attribute by which an environment keeps the function that made it.
-_FACTORY = "made_by"
+FACTORY = "made_by"
 
 #: What an environment argument may be: the environment, its id, or a function that makes a new one.
 EnvSource: TypeAlias = gym.Env | VecEnv | str | Callable[[], gym.Env | VecEnv]
@@ -43,15 +46,14 @@ def make_env(env: EnvSource, name: str = "env") -> gym.Env | VecEnv:
     :param name: of the argument, for the message
     :raises TypeError: the function returns something else
     """
-    if isinstance(env, str):
-        return gym.make(env)
-    if isinstance(env, gym.Env | VecEnv) or not callable(env):  # what is no environment is refused elsewhere
-        return env
-    made = env()
+    if isinstance(env, gym.Env | VecEnv) or not (isinstance(env, str) or callable(env)):
+        return env  # what is no environment is refused elsewhere
+    make = partial(gym.make, env) if isinstance(env, str) else env
+    made = make()
     if not isinstance(made, gym.Env | VecEnv):
         raise TypeError(f"{name}: the function returned {type(made).__name__}; it must return a new environment")
     if isinstance(made, gym.Env):
-        setattr(made, _FACTORY, env)
+        setattr(made, FACTORY, make)
     return made
 
 
@@ -82,7 +84,7 @@ def must_copy(env: gym.Env | VecEnv) -> gym.Env:
     try:
         return _copied(original, {})
     except Exception as error:  # whatever the contents of a user's environment raise when copied
-        made = next((layer for layer in layers(original) if _FACTORY in vars(layer)), None)
+        made = next((layer for layer in layers(original) if FACTORY in vars(layer)), None)
         if made is None:
             raise CopyError(f"{error}; pass a function that makes it, or an id, in its place") from error
         return _copied(original, _made_anew(made))
@@ -93,19 +95,16 @@ def _made_anew(env: gym.Env) -> dict[int, Any]:
 
     :return: it and its parts, by the ``id`` of those that they replace
     """
-    twin = vars(env)[_FACTORY]()
-    setattr(twin, _FACTORY, vars(env)[_FACTORY])
+    twin = vars(env)[FACTORY]()
+    setattr(twin, FACTORY, vars(env)[FACTORY])
     base, new = env.unwrapped, twin.unwrapped
     parts = {id(env): twin, id(base): new}
     twin.reset(seed=0)  # some have no simulation before
-    if type(getattr(base, "data", None)).__name__ == "MjData":
-        import mujoco
-
-        from sb3_rpto.effects.wrapper import with_numbers
-
+    if isinstance(getattr(base, "data", None), mujoco.MjData):
         with_numbers(twin, base.model)
         mujoco.mj_copyData(new.data, new.model, base.data)
         parts |= {id(base.model): new.model, id(base.data): new.data}
+    new.render_mode = None
     new._np_random, new._np_random_seed = _copied(base._np_random, {}), base._np_random_seed
     return parts
 
@@ -141,7 +140,7 @@ class _Pickler(pickle.Pickler):
         if isinstance(value, types.FunctionType):
             _require_apart(value, set())
             return self._kept(value)
-        if kind.__name__ in ("MjModel", "MjData", "MjSpec"):
+        if isinstance(value, mujoco.MjModel | mujoco.MjData | mujoco.MjSpec):
             return self._kept(self._simulation(value))
         if isinstance(value, np.ndarray) and _is_view_of_a_simulation(value):
             raise pickle.PicklingError("it holds an array that is a view of the simulation")
@@ -151,6 +150,8 @@ class _Pickler(pickle.Pickler):
         if isinstance(value, _DRAWING):
             return _itself, (value.env,)
         if isinstance(value, gym.Env):  # EzPickle would make a new one from the constructor's arguments
+            if FACTORY in vars(value):
+                self.known[id(vars(value)[FACTORY])] = vars(value)[FACTORY]
             state = vars(value) if isinstance(value, gym.Wrapper) else {**vars(value), "render_mode": None}
             return object.__new__, (type(value),), state, None, None, _set_state
         return NotImplemented
@@ -161,8 +162,6 @@ class _Pickler(pickle.Pickler):
 
     def _simulation(self, value: Any) -> Any:
         """A copy of an ``MjModel`` or ``MjSpec``; of an ``MjData`` one that steps the copy of its model."""
-        import mujoco
-
         if isinstance(value, mujoco.MjData):
             self.persistent_id(value.model)
             twin = mujoco.MjData(self.known[id(value.model)])

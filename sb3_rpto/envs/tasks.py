@@ -1,17 +1,16 @@
-"""The paper's tasks and targets, and those of the quick suite, as gymnasium ids; importing this needs no MuJoCo."""
+"""The paper's tasks and targets, and those of the quick suite, as gymnasium ids."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
-if TYPE_CHECKING:
-    from sb3_rpto.envs.shifts import EnvShift
+from sb3_rpto.envs.shifts import EnvShift, as_shift
 
 #: Seeds of the random targets; the paper has four for each task.
 TARGETS = (0, 1, 2, 3)
@@ -120,8 +119,6 @@ def make_shift(task: str, name: str, env: gym.Env | None = None) -> EnvShift:
     :param env: the task's source, if there is one already
     :raises ValueError: an unknown task, an unknown shift, or one that means nothing in this task
     """
-    from sb3_rpto.envs.shifts import EnvShift
-
     known = _task(task)
     if found := re.fullmatch(r"target(\d+)", name):
         names = [*known.lengths, *known.frictions]
@@ -147,8 +144,6 @@ def make(task: str, shift: str | EnvShift | Mapping[str, Any] | None = None, **k
     env: gym.Env = maker(**{**known.kwargs, **kwargs})
     if shift is None:
         return env
-    from sb3_rpto.envs.shifts import as_shift
-
     return (make_shift(task, shift, env) if isinstance(shift, str) else as_shift(shift)).wrap(env)
 
 

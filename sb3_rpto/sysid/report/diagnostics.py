@@ -221,7 +221,7 @@ def creeping(problem: Problem, values: np.ndarray, named: Sequence[int]) -> tupl
     places = [s for e, s in zip(simulation.effects, simulation.slices) if e in there]
     free = np.concatenate([np.arange(s.start, s.stop) for s in places])
     model = simulation.model.__copy__()
-    # A joint that has some keeps its own constraint, see World.rough.
+    # A joint that has some keeps its own constraint, see SimulationBatch.rough.
     model.dof_frictionloss[[e.dof for e in firm]] = LITTLE
     soft = Simulation(model, simulation.effects, simulation.nthread)
     fit = Problem(soft, problem.windows, problem.scales).fit(values, free, iterations=SOFT_FIT)
