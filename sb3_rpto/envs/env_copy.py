@@ -97,7 +97,8 @@ def _made_anew(env: gym.Env) -> dict[int, Any]:
     """
     twin = vars(env)[FACTORY]()
     setattr(twin, FACTORY, vars(env)[FACTORY])
-    base, new = env.unwrapped, twin.unwrapped
+    base: Any = env.unwrapped
+    new: Any = twin.unwrapped
     parts = {id(env): twin, id(base): new}
     twin.reset(seed=0)  # some have no simulation before
     if isinstance(getattr(base, "data", None), mujoco.MjData):

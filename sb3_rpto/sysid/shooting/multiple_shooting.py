@@ -260,15 +260,16 @@ class Problem:
         values = values.copy()
         values[free] = np.clip(values[free], self.lower[free], self.upper[free])
         starts = np.zeros((len(self.windows), 2 * self.simulation.model.nv)) if starts is None else starts.copy()
+        begin: Estimate = (values, starts, None)
         descent = minimise(
             lambda point: self.around(*point, free, tolerance, crude),
-            (values, starts, None),
+            begin,
             trust=1e-3,
             ladder=LADDER if len(free) else LADDER[:1],
             iterations=iterations,
         )
-        values, starts, r = descent.point
-        assert r is not None  # there is an iteration
+        values, starts, _ = descent.point
+        r = _residuals(descent.point)
         around = descent.around
         linear = (
             Linear(around.reduced.normal, around.reduced.gradient, free) if isinstance(around, Neighbourhood) else None
@@ -427,9 +428,7 @@ class Neighbourhood:
 
     def converged(self, fall: float) -> bool:
         """Whether a step would gain less than the tolerance, or all windows are met exactly."""
-        _, _, r = self.point
-        assert r is not None  # it was linearised there
-        return bool(fall < self.tolerance * self.cost or self.problem.errors(r).max() < MET)
+        return bool(fall < self.tolerance * self.cost or self.problem.errors(_residuals(self.point)).max() < MET)
 
     def best_trial(self, trusts: np.ndarray) -> Trial[Estimate]:
         """Simulate the steps of several dampings side by side, and take the best.
@@ -469,7 +468,7 @@ class Neighbourhood:
             return False
         if trial.fall > self.crude * self.cost:
             return False
-        after, before = (window_costs(self.loss, p[2], p[1]) for p in (trial.point, self.point))
+        after, before = (window_costs(self.loss, _residuals(p), p[1]) for p in (trial.point, self.point))
         return bool(np.median(after / np.maximum(before, 1e-300)) > 1 - self.crude)
 
     def _step(self, damping: float) -> np.ndarray:
@@ -491,6 +490,12 @@ class Neighbourhood:
         pull = np.where(problem.known[free], 0.0, 1 / RIDGE**2)
         z = (self.point[0][free] - problem.null[free]) / problem.size[free]
         return self.reduced.normal.sum(0) + np.diag(pull), self.reduced.gradient.sum(0) + pull * z
+
+
+def _residuals(estimate: Estimate) -> np.ndarray:
+    """Residuals (W, R) of an estimate around which the cost was linearised, or that a step led to."""
+    assert estimate[2] is not None
+    return estimate[2]
 
 
 def start_weight(loss: Loss) -> float:
