@@ -1,16 +1,17 @@
-"""The paper's tasks and targets, and those of the quick suite, as gymnasium ids."""
+"""The paper's tasks and targets, and those of the quick suite, as gymnasium ids; importing this needs no MuJoCo."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
-from sb3_rpto.envs.shifts import EnvShift, as_shift
+if TYPE_CHECKING:
+    from sb3_rpto.envs.shifts import EnvShift
 
 #: Seeds of the random targets; the paper has four for each task.
 TARGETS = (0, 1, 2, 3)
@@ -119,6 +120,8 @@ def make_shift(task: str, name: str, env: gym.Env | None = None) -> EnvShift:
     :param env: the task's source, if there is one already
     :raises ValueError: an unknown task, an unknown shift, or one that means nothing in this task
     """
+    from sb3_rpto.envs.shifts import EnvShift
+
     known = _task(task)
     if found := re.fullmatch(r"target(\d+)", name):
         names = [*known.lengths, *known.frictions]
@@ -144,6 +147,8 @@ def make(task: str, shift: str | EnvShift | Mapping[str, Any] | None = None, **k
     env: gym.Env = maker(**{**known.kwargs, **kwargs})
     if shift is None:
         return env
+    from sb3_rpto.envs.shifts import as_shift
+
     return (make_shift(task, shift, env) if isinstance(shift, str) else as_shift(shift)).wrap(env)
 
 
