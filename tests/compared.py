@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_rpto.effects.model import numbers
+from sb3_rpto.effects.model_numbers import numbers
 
 
 def fields(env):

@@ -5,7 +5,7 @@ import os
 import mujoco
 
 from sb3_rpto.cores import cores
-from sb3_rpto.effects.world import BatchWorld
+from sb3_rpto.effects.batch import MujocoBatch
 
 MODEL = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>")
 
@@ -13,8 +13,8 @@ MODEL = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><joint/><geom s
 def test_cores_are_those_that_the_process_is_bound_to(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {4, 7, 9}, raising=False)
     assert cores() == 3
-    assert BatchWorld(MODEL, 8).batch.nthread == 3
-    assert BatchWorld(MODEL, 8, 1).batch.nthread == 1
+    assert MujocoBatch(MODEL, 8).engine.nthread == 3
+    assert MujocoBatch(MODEL, 8, 1).engine.nthread == 1
 
 
 def test_where_none_can_be_bound_all_count(monkeypatch):

@@ -17,11 +17,11 @@ from benchmarks.tracing.planting import SYSTEMS, Link, System
 from benchmarks.tracing.planting.excitation import Excitation
 from benchmarks.tracing.planting.generate import SPREAD, VELOCITY_NOISE
 from sb3_rpto.effects import LIBRARY, Effect, declare
+from sb3_rpto.effects.batch import MujocoBatch
 from sb3_rpto.effects.model import load_model
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.effects.sensors import ago
 from sb3_rpto.effects.simulation import Push, prepare, pushing
-from sb3_rpto.effects.world import BatchWorld
 from sb3_rpto.sysid import Measurements
 
 STEP = 0.0005
@@ -187,7 +187,7 @@ def simulate(
 
     joints, motors = object_names(model, "joint"), object_names(model, "actuator")
     moved = [joints.index(link.joint) for link in machine.system.links]
-    world = BatchWorld(model, episodes, 1)
+    world = MujocoBatch(model, episodes, 1)
     world.qpos[:] = model.qpos0
     world.qpos[:, moved] = excitation.q + machine.rest
     rows = [(effect, np.tile(effect.values, (episodes, 1))) for effect in acting]
@@ -222,7 +222,7 @@ def simulate(
             for effect, x, memory in chain:
                 world.ctrl[:, effect.ctrl] = effect.command(world.ctrl[:, effect.ctrl].copy(), x, memory, step)
             push(begins=substep == 0)
-            world.batch.step()
+            world.engine.step()
             past.append((world.qpos.copy(), world.qvel.copy()))
     if not np.isfinite(measured).all():
         raise ValueError(f"{machine.name} became unstable with {', '.join(map(str, effects))}; plant less")

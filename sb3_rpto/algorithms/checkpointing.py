@@ -10,11 +10,9 @@ from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
 import cloudpickle
-import gymnasium as gym
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
-from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_rpto.algorithms import model_zip
 from sb3_rpto.algorithms.argument_ranges import check_given
@@ -32,6 +30,7 @@ from sb3_rpto.algorithms.target_checks import check_simulator
 from sb3_rpto.algorithms.two_env_sac import RuleOfEnvironment, TwoWorlds
 from sb3_rpto.buffers import DualReplayBuffer
 from sb3_rpto.effects.names import near
+from sb3_rpto.envs.env_copy import EnvSource, make_env
 from sb3_rpto.files import write_atomically
 
 Self = TypeVar("Self", bound="Resumable")
@@ -151,9 +150,9 @@ class Resumable(TwoWorlds):
     def load(
         cls: type[Self],
         path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | str | None = None,
+        env: EnvSource | None = None,
         *args: Any,
-        target_env: GymEnv | str | None = None,
+        target_env: EnvSource | None = None,
         **kwargs: Any,
     ) -> Self:
         """Load a checkpoint; without environments the model can predict, with them it resumes.
@@ -190,8 +189,8 @@ class Resumable(TwoWorlds):
                 + (f" ({misfit})" if misfit else "")
                 + f"; start from a SAC model by {cls.__name__}.from_source(path, env, target_env=...)"
             )
-        env = gym.make(env) if isinstance(env, str) else env
         if env is not None:
+            env = make_env(env)
             check_environment(env, "env")
         with one_kind_of_temperature(kwargs):
             model = super().load(file, env, *args, **kwargs)

@@ -107,7 +107,7 @@ def check_something_to_fit(config: dict[str, Any], close_loop: bool | Sequence[s
     if config["backend"] != "physical" or not is_mujoco(config):
         return
     if close_loop is not False or traces_log:
-        model = config["model"]
+        model = config["mj_model"]
         compiled = model.compile() if isinstance(model, PlainModel) else model
         given(compiled, config.get("declared", ()), [from_json(stored) for stored in config.get("effects", ())])
     if not close_loop and not config.get("declared") and not config.get("effects"):

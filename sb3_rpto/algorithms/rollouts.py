@@ -24,7 +24,7 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
 from sb3_rpto.effects import Effect
-from sb3_rpto.effects.stance import StandingEnv
+from sb3_rpto.effects.walker_reset import StandingEnv
 from sb3_rpto.envs.env_copy import must_copy
 from sb3_rpto.envs.env_snapshot import reseed, restore_state, save_state, whereabouts
 
@@ -190,7 +190,7 @@ class EpisodeSource(SourceWorld):
 class DrawnEnv(StandingEnv):
     """A simulator with other effects in each episode, drawn before it begins: it starts as the machine that it is.
 
-    :param env: as of :class:`~sb3_rpto.effects.stance.StandingEnv`
+    :param env: as of :class:`~sb3_rpto.effects.walker_reset.StandingEnv`
     :param effects: until its first reset
     :param draw: the next episode's
     """

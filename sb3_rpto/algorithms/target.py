@@ -268,8 +268,8 @@ def check_environment(env: gym.Env | VecEnv, name: str) -> None:
     """
     if not isinstance(env, gym.Env | VecEnv):
         raise TypeError(
-            f"{name} must be a gymnasium environment, a VecEnv or an id, not {type(env).__name__}; call what makes "
-            "one, stack several by make_vec_env, and pass recordings as target_data="
+            f"{name} must be a gymnasium environment, a VecEnv, an id or a function that makes one, not "
+            f"{type(env).__name__}; stack several by make_vec_env, and pass recordings as target_data="
         )
     if isinstance(env, gym.Env) and not accepts_seed(env):
         raise ValueError(

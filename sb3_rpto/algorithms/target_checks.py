@@ -19,7 +19,7 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.dynamics.simulator import check_source
 from sb3_rpto.effects import Declared
-from sb3_rpto.effects.model import differing, sites_act
+from sb3_rpto.effects.model_numbers import differing, sites_act
 from sb3_rpto.envs.env_copy import copy_env
 from sb3_rpto.envs.observations import layers, mujoco_model, single_env, state_map
 from sb3_rpto.sysid.data.columns import columns_of
@@ -128,7 +128,7 @@ def check_simulator(source: VecEnv, dynamics: Dynamics | None, single_steps: boo
         try_source(source, dynamics, single_steps)
         model = mujoco_model(single_env(source))
         # Places that nothing acts at are marks, such as a goal's, which a task may move.
-        found = [n for n in differing(physical.model, model) if not n.startswith("site_") or sites_act(model)]
+        found = [n for n in differing(physical.mj_model, model) if not n.startswith("site_") or sites_act(model)]
     elif isinstance(physical, CartPoleDynamics):
         found = [name for name, value in cartpole_constants(source).items() if value != physical.nominal[name]]
     else:

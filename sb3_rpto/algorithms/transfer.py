@@ -7,14 +7,13 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any, Literal, TypeVar, cast
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_rpto.algorithms import (
@@ -38,6 +37,7 @@ from sb3_rpto.dynamics.base import Dynamics
 from sb3_rpto.dynamics.factory import dynamics_config, make_dynamics, preset_section
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.weights import WeightingName
+from sb3_rpto.envs.env_copy import EnvSource, make_env
 from sb3_rpto.envs.task_rules import env_id
 from sb3_rpto.presets import resolve_preset
 from sb3_rpto.sysid import Measurements
@@ -58,7 +58,8 @@ class TransferAlgorithm(Looping):
     The arguments up to ``device`` are SAC's, with SAC's defaults, except that ``gradient_steps`` counts updates per
     TARGET step and ``learning_starts`` applies to the source alone (no random action is ever taken in the target).
 
-    :param target_env: the scarce world, an environment, a VecEnv or an id; ``learn()`` needs it or ``target_data``
+    :param target_env: the scarce world, an environment, a VecEnv, an id or a function that makes one; ``learn()``
+        needs it or ``target_data``
     :param target_data: the target recorded beforehand, in place of ``target_env`` (RTO and RPTO): transitions (a replay
         buffer, its pickle or an ``.npz``), or :class:`~sb3_rpto.sysid.Measurements` of a robot, on the joints and
         actuators of ``env``'s MuJoCo model. D_target then holds the steps that ``env`` would have taken there
@@ -106,7 +107,7 @@ class TransferAlgorithm(Looping):
     def __init__(
         self,
         policy: str | type[SACPolicy],
-        env: GymEnv | str,
+        env: EnvSource,
         learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 1_000_000,
         learning_starts: int = 100,
@@ -134,7 +135,7 @@ class TransferAlgorithm(Looping):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
         *,
-        target_env: GymEnv | str | None = None,
+        target_env: EnvSource | None = None,
         target_data: ReplayBuffer | str | pathlib.Path | Measurements | None = None,
         preset: str = "default",
         dynamics: Literal["ensemble", "physical", "residual"] = "ensemble",
@@ -151,9 +152,8 @@ class TransferAlgorithm(Looping):
     ) -> None:
         self._passed |= arguments.set_among(TransferAlgorithm.__init__, locals())  # by a subclass's __init__, too
         argument_ranges.check_given(locals())
-        if isinstance(env, str):
-            env = gym.make(env)
         if env is not None:  # SB3's load() builds the object before it has an env
+            env = make_env(env)
             check_environment(env, "env")
             check_spaces(env.observation_space, env.action_space)
         arguments.check_one_target(target_env, target_data)
@@ -307,8 +307,8 @@ class TransferAlgorithm(Looping):
     def from_source(
         cls: type[Self],
         source_model: SAC | str | pathlib.Path,
-        env: GymEnv | str,
-        target_env: GymEnv | str | None = None,
+        env: EnvSource,
+        target_env: EnvSource | None = None,
         *,
         source_data: ReplayBuffer | str | pathlib.Path | None = None,
         vec_normalize: normalisation.Statistics = None,
@@ -329,8 +329,7 @@ class TransferAlgorithm(Looping):
         :param kwargs: constructor arguments; they win over the source model's and the preset's
         :raises ValueError: when the source model's spaces are not the environment's, or ``vec_normalize`` is not of it
         """
-        if isinstance(env, str):
-            env = gym.make(env)
+        env = make_env(env)
         check_environment(env, "env")
         argument_ranges.check_given(kwargs)
         device = kwargs.get("device", "auto")

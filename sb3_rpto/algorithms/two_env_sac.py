@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
-import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -34,6 +33,7 @@ from sb3_rpto.algorithms.target_checks import check_machine, check_simulator, do
 from sb3_rpto.algorithms.transition_checks import Answers, check_finite
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.factory import is_mujoco
+from sb3_rpto.envs.env_copy import EnvSource, make_env
 from sb3_rpto.envs.task_rules import task_rules
 
 if TYPE_CHECKING:
@@ -116,19 +116,18 @@ class TwoWorlds(PolicySnapshots):
 
     # ------------------------------------------------------------------ the worlds
 
-    def set_target_env(self, env: GymEnv | str) -> None:
+    def set_target_env(self, env: EnvSource) -> None:
         """Set the target; the next ``learn()`` starts a new episode there.
 
         In the place of another target it begins with an empty D_target, no best policy, and a closed loop that has seen
         nothing.
 
-        :param env: an environment, a VecEnv or an id
+        :param env: an environment, a VecEnv, an id, or a function that makes one
         :raises ValueError: when it is the source itself, has other spaces, cannot be reset with a seed, or is another
             machine (joints, length of a step) than the simulator that is fitted to it
         :raises TypeError: for what is no environment
         """
-        if isinstance(env, str):
-            env = gym.make(env)
+        env = make_env(env, "target_env")
         check_environment(env, "target_env")
         venv = sharing(self._wrap_env(env, self.verbose), self.env)
         if self.env is not None:

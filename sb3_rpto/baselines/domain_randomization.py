@@ -19,7 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_rpto.baselines.sac_variants import fine_tuned_sac
 from sb3_rpto.effects import declare
-from sb3_rpto.effects.stance import StandingEnv
+from sb3_rpto.effects.walker_reset import StandingEnv
 from sb3_rpto.evaluation.learning_curve import MakeEnv
 from sb3_rpto.files import write_json
 

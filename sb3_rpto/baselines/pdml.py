@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_rpto.algorithms.rollouts import BranchSource, SourceWorld
 from sb3_rpto.algorithms.update import RelativeUpdate
 from sb3_rpto.baselines.mbpo import MBPO
 from sb3_rpto.dynamics.base import Transitions
+from sb3_rpto.envs.env_copy import EnvSource
 from sb3_rpto.ranges import SHARE_BELOW_1, check, whole
 
 #: Distances between policies are means over at most so many of the newest states of D_target.
@@ -110,7 +110,7 @@ class PDML(MBPO):
         super()._check_numbers()
         check({"block_steps": whole(1), "newest_share": SHARE_BELOW_1}, vars(self))
 
-    def set_target_env(self, env: GymEnv | str) -> None:
+    def set_target_env(self, env: EnvSource) -> None:
         """Set the target; in the place of another one, with no blocks of it."""
         replaced = self.target_env is not None
         super().set_target_env(env)

@@ -12,8 +12,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_rpto.algorithms.target import share_normalisation
 from sb3_rpto.baselines.mbpo import MBPO
 from sb3_rpto.baselines.policy_distillation import SquashedMeanPolicy, clone, clone_kwargs
+from sb3_rpto.baselines.slbo_dynamics import DeterministicDynamics
 from sb3_rpto.dynamics.base import Dynamics
-from sb3_rpto.dynamics.deterministic import DeterministicDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
 from sb3_rpto.ranges import check, whole
 
@@ -24,7 +24,7 @@ class SLBO(MBPO):
     Paper: https://arxiv.org/abs/1807.03858 (Luo, Xu, Li, Tian, Darrell, Ma: Algorithmic Framework for Model-based Deep
     Reinforcement Learning with Theoretical Guarantees, ICLR 2019).
 
-    In the loop of MBPO the model is :class:`~sb3_rpto.dynamics.deterministic.DeterministicDynamics`, and the policy is
+    In the loop of MBPO the model is :class:`~sb3_rpto.baselines.slbo_dynamics.DeterministicDynamics`, and the policy is
     ``trpo`` (``sb3_contrib.TRPO``), cloned from the SAC policy on states of the source before the first target step.
     Every ``model_train_freq`` target steps there is a stage: ``iterations`` times ``model_steps`` gradient steps of the
     model and ``policy_updates`` TRPO updates, each on ``rollout_samples`` steps of the model from initial states of the
@@ -38,7 +38,7 @@ class SLBO(MBPO):
     :param rollout_length: after how many of them an episode in the model is cut off
     :param trpo_kwargs: arguments of ``sb3_contrib.TRPO``
     :param kwargs: as those of :class:`~sb3_rpto.baselines.mbpo.MBPO`; ``dynamics_kwargs`` are those of
-        :class:`~sb3_rpto.dynamics.deterministic.DeterministicDynamics`
+        :class:`~sb3_rpto.baselines.slbo_dynamics.DeterministicDynamics`
     :raises ValueError: for numbers that are not positive, or rollouts longer than the samples
     :raises ImportError: without sb3-contrib
     """

@@ -47,7 +47,7 @@ class Corrected(options.World):
     def make(self, **more: Any) -> gym.Env:
         """The corrected environment."""
         from sb3_rpto.effects.corrected_model_io import read_effects
-        from sb3_rpto.effects.stance import StandingEnv
+        from sb3_rpto.effects.walker_reset import StandingEnv
 
         env = super().make(**more)
         base: Any = env.unwrapped

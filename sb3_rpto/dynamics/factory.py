@@ -79,7 +79,7 @@ def _simulator(env: VecEnv, backend: str) -> dict[str, Any]:
 
 def is_mujoco(config: dict[str, Any]) -> bool:
     """Whether a config is that of a MuJoCo simulator."""
-    return "model" in config
+    return "mj_model" in config
 
 
 def make_dynamics(config: dict[str, Any], observation_space: spaces.Box, action_space: spaces.Box) -> Dynamics:

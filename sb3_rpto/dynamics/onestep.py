@@ -7,33 +7,33 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import torch as th
-from scipy.optimize import lsq_linear
 
 from sb3_rpto.dynamics.base import Transitions, predecessors
-from sb3_rpto.dynamics.box import stepped
-from sb3_rpto.dynamics.identifiable import entangled, null_directions, to_hold
 from sb3_rpto.effects import Simulation
 from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.sensors import ago
 from sb3_rpto.effects.simulation import Drive
 from sb3_rpto.envs.observations import StateMap, known_at_rest
+from sb3_rpto.fitting.covariance import sandwich_covariance, serial_scatter
+from sb3_rpto.fitting.gauss_newton import Trial, add_ridge, add_step, bounded_least_squares, minimise
+from sb3_rpto.fitting.identifiability import confounded_parameters, null_directions, parameters_to_fix, sensitive
+from sb3_rpto.fitting.loss import Loss
 
 #: Commands from before a transition, for delays and filters, in s, and at least of so many transitions.
 MEMORY, FILTERED = 0.2, 10
 #: Finite differences, in the parameters' scales: wide ones see over the kinks of contacts, narrow ones see the slope.
 DIFFERENCES = (1e-2, 1e-3, 1e-4)
 #: Shares of the trusted size that a step may have.
-REACHES = 0.25 ** np.arange(5)
-#: A parameter that moves no residual by this share of the typical one, for a change by its scale, is not identified,
-#: nor is one whose standard error is more than this many of its scales (or times what it was), unless it is so many
-#: standard errors from what it was.
-UNSEEN, VAGUE, CLEARLY = 1e-3, 1.0, 3.0
+REACHES = (tuple(0.25 ** np.arange(5)),)
+#: A parameter whose standard error is more than this many of its scales (or times what it was) is not identified,
+#: unless it is so many standard errors from what it was.
+VAGUE, CLEARLY = 1.0, 3.0
+#: A fit stops when no parameter moves by more than this share of its scale.
+STILL = 1e-6
 #: Scores of so many transitions in a row may be correlated.
 LAGS = 4
-#: Weight, relative to the data's, of the wish that a step be small.
-RIDGE = 1e-4
-#: Contacts make local optima: the loss turns linear at so many typical residuals, so that a missed touch-down is borne.
-CLIP = 3.0
+#: Typical residuals are not taken to be smaller, in standard one-step changes: of exact data they are rounding.
+LEAST = 1e-6
 #: Residuals of what blows up, in standard one-step changes.
 BLOWN = 100.0
 
@@ -153,7 +153,7 @@ def _history(commands: np.ndarray, before: np.ndarray, rows: np.ndarray, earlier
     return np.stack(history, axis=1)
 
 
-class OneStep:
+class OneStepError:
     """The robust weighted one-step error, as a function of phi.
 
     :param simulation: whose parameters phi is
@@ -176,13 +176,54 @@ class OneStep:
         self.simulation, self.scale, self.lower, self.upper, self.steps = simulation, scale, lower, upper, steps
         share = np.ones(len(steps)) if weights is None else weights.cpu().numpy().astype(float)[steps.rows]
         self.share = share / share.sum()
-        self.clip = 1.0
-        #: parameters that the transitions did not show at the last step, and those found :meth:`vague`, (p,)
-        self.unseen = np.zeros(len(scale), dtype=bool)
-        self.left = np.zeros(len(scale), dtype=bool)
+        #: of the residuals where phi was linearised last
+        self.loss = Loss(1.0)
+        nothing = np.zeros(len(scale), dtype=bool)
+        #: parameters that the transitions did not show there, and those that they show too faintly to tell, (p,)
+        self.insensitive, self.vague = nothing, nothing
         #: parameters that the transitions show, but do not tell apart, and those of them that stay, (p,)
-        self.entangled = np.zeros(len(scale), dtype=bool)
-        self.held = np.zeros(len(scale), dtype=bool)
+        self.confounded, self.fixed = nothing, nothing
+
+    @property
+    def free(self) -> np.ndarray:
+        """Which parameters may move, (p,)."""
+        return ~self.fixed & ~self.vague
+
+    def fit(self, begin: np.ndarray, max_step: float, most: int) -> tuple[np.ndarray, int]:
+        """Lower the error by trusted Gauss-Newton steps; what the transitions do not tell stays.
+
+        :param begin: phi, (p,)
+        :param max_step: largest change of a parameter in a step, as a share of its scale or its value, whichever is
+            larger
+        :param most: steps
+        :return: phi (p,), and how many steps led there
+        """
+        self.fix_confounded(begin)
+        values, taken = self.descend(begin, max_step, most)
+        vague = self.find_vague(values, begin)
+        while (values != begin)[vague].any():  # what the data do not tell has moved: without it, from the start
+            self.vague = self.vague | vague
+            values, taken = self.descend(begin, max_step, most)
+            vague = self.find_vague(values, begin)
+        self.vague = self.vague | vague
+        return values, taken
+
+    def descend(self, values: np.ndarray, max_step: float, most: int) -> tuple[np.ndarray, int]:
+        """At most ``most`` trusted steps from ``values`` on: where they lead, and how many they were."""
+        descent = minimise(self.linearise, values, trust=max_step, ladder=REACHES, iterations=most)
+        return descent.point, descent.steps
+
+    def linearise(self, values: np.ndarray) -> OneStepLinearisation:
+        """The error around phi (p,), from narrow and wide differences."""
+        parts, self.insensitive = [], np.ones(len(values), dtype=bool)
+        for difference in DIFFERENCES:
+            residual, slopes = self.differentiate(values, difference)
+            self.loss = Loss.of(residual, LEAST)
+            a, b = self.weighted(residual, slopes)
+            shown = sensitive(a, b)
+            self.insensitive &= ~shown
+            parts.append((a, b, shown))
+        return OneStepLinearisation(self, values, parts)
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
         """Errors of ``k`` phis (k, p) in standard one-step changes, (k, n, c)."""
@@ -192,10 +233,9 @@ class OneStep:
 
     def cost(self, residuals: np.ndarray) -> np.ndarray:
         """The weighted robust error, (k,), of residuals (k, n, c)."""
-        soft = 2 * self.clip**2 * (np.sqrt(1 + (residuals / self.clip) ** 2) - 1)
-        return np.einsum("knc,n->k", soft, self.share) / residuals.shape[2]
+        return np.asarray(np.einsum("knc,n->k", self.loss.cost(residuals), self.share) / residuals.shape[2])
 
-    def linearise(self, values: np.ndarray, difference: float) -> tuple[np.ndarray, np.ndarray]:
+    def differentiate(self, values: np.ndarray, difference: float) -> tuple[np.ndarray, np.ndarray]:
         """Residuals at one phi (p,), (n, c), and their derivative by phi in scales, (n, c, p).
 
         :param difference: of the parameters, in scales; negative: downwards
@@ -207,74 +247,40 @@ class OneStep:
         slopes = (found[1:] - found[0]) * (self.scale / change)[:, None, None]
         return found[0], slopes.transpose(1, 2, 0)
 
-    def hold_what_is_not_determined(self, values: np.ndarray) -> None:
+    def fix_confounded(self, values: np.ndarray) -> None:
         """Let one parameter stay for each direction of phi, at ``values`` (p,), that no residual shows."""
         narrow = DIFFERENCES[-1]
-        (residual, up), (_, down) = self.linearise(values, narrow), self.linearise(values, -narrow)
-        self.clip = _clip(residual)
+        (residual, up), (_, down) = self.differentiate(values, narrow), self.differentiate(values, -narrow)
+        self.loss = Loss.of(residual, LEAST)
         # One-sided differences of products such as gear x gain would leave a trace of the direction.
-        a, b = self._weighted(residual, (up + down) / 2)
-        directions = null_directions(a.T @ a, _shown(a, b))
-        self.entangled, self.held = entangled(directions), to_hold(directions)
+        a, b = self.weighted(residual, (up + down) / 2)
+        directions = null_directions(a.T @ a, sensitive(a, b))
+        self.confounded, self.fixed = confounded_parameters(directions), parameters_to_fix(directions)
 
-    def step(self, values: np.ndarray, max_step: float) -> np.ndarray | None:
-        """A Gauss-Newton step that lowers the cost, within the bounds and a trusted size; None where there is none.
-
-        Steps from narrow and wide differences and of several sizes are simulated; the best is taken.
-
-        :param values: phi, (p,)
-        :param max_step: largest change of a parameter, as a share of its scale or its value, whichever is larger
-        """
-        self.unseen[:] = True
-        trials = [values]
-        for difference in DIFFERENCES:
-            residual, slopes = self.linearise(values, difference)
-            self.clip = _clip(residual)
-            trials += [self._within(values, residual, slopes, max_step * reach) for reach in REACHES]
-        costs = self.cost(self.residuals(np.stack(trials)))
-        best = int(np.argmin(costs))
-        return trials[best] if costs[best] < costs[0] else None
-
-    def _within(self, values: np.ndarray, residual: np.ndarray, slopes: np.ndarray, reach: float) -> np.ndarray:
-        """The weighted least-squares step in the bounds and within a reach as :meth:`step` says."""
-        a, b = self._weighted(residual, slopes)
-        shown = _shown(a, b)
-        self.unseen &= ~shown
-        free = np.flatnonzero(shown & ~self.held & ~self.left)
-        step = np.zeros(len(values))
-        if len(free):
-            a, b = _ridged(a[:, free], b)
-            low, high = ((bound - values)[free] / self.scale[free] for bound in (self.lower, self.upper))
-            far = reach * np.maximum(1.0, np.abs(values[free]) / self.scale[free])
-            # The solver wants boxes with an inside.
-            box = np.minimum(np.maximum(low, -far), -1e-12), np.maximum(np.minimum(high, far), 1e-12)
-            step[free] = lsq_linear(a, b, box, method="bvls").x * self.scale[free]
-        return stepped(values, step, self.lower, self.upper)
-
-    def _weighted(self, residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def weighted(self, residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The least squares ``a x = b`` of a step x in scales: (n c, p) and (n c,)."""
-        root = np.sqrt(self.robust(residual))
+        root = np.sqrt(self.weights(residual))
         return (root[:, :, None] * slopes).reshape(-1, slopes.shape[2]), -(root * residual).reshape(-1)
 
-    def robust(self, residual: np.ndarray) -> np.ndarray:
+    def weights(self, residual: np.ndarray) -> np.ndarray:
         """Weights of the residuals (n, c) in the least squares that stand for the robust loss."""
-        return np.asarray(self.share[:, None] / np.sqrt(1 + (residual / self.clip) ** 2))
+        return self.loss.weights(residual, self.share[:, None])
 
     def covariance(self, values: np.ndarray) -> np.ndarray:
-        """Covariance of phi by the sandwich estimate (Huber 1967), (p, p).
+        """Covariance of phi by the sandwich estimate, (p, p).
 
-        Scores of up to :data:`LAGS` transitions in a row may be correlated (Newey and West 1987): an observation that
-        errs ends one transition and begins the next, and what the simulator lacks lasts longer than a transition.
-        Of what the transitions do not show or tell apart the variance is infinite, and the rest of its row zero.
+        Scores of up to :data:`LAGS` transitions in a row may be correlated: an observation that errs ends one
+        transition and begins the next, and what the simulator lacks lasts longer than a transition. Of what the
+        transitions do not show or tell apart the variance is infinite, and the rest of its row zero.
         """
-        here = self.linearise(values, DIFFERENCES[1])
-        told = self._covariance(*self._curvature(*here), ~self.held & ~self.left) * np.outer(self.scale, self.scale)
-        unknown = self.unseen | self.entangled
+        curvature = self.curvature(*self.differentiate(values, DIFFERENCES[1]))
+        told = self.covariance_in_scales(*curvature, self.free) * np.outer(self.scale, self.scale)
+        unknown = self.insensitive | self.confounded
         told[unknown] = told[:, unknown] = 0.0
         told[unknown, unknown] = np.inf
         return told
 
-    def vague(self, values: np.ndarray, begin: np.ndarray) -> np.ndarray:
+    def find_vague(self, values: np.ndarray, begin: np.ndarray) -> np.ndarray:
         """Parameters that the transitions show, if at all, too faintly to tell: :data:`VAGUE`; (p,).
 
         One after the other, the vaguest first: of two that act almost alike the other may be told given the one.
@@ -284,13 +290,13 @@ class OneStep:
         :param values: phi, (p,)
         :param begin: phi before, where what is vague stays, (p,)
         """
-        residual, slopes = self.linearise(values, DIFFERENCES[1])
-        free, found = ~self.held & ~self.left & ~self.unseen, self.unseen.copy()
+        residual, slopes = self.differentiate(values, DIFFERENCES[1])
+        free, found = self.free & ~self.insensitive, self.insensitive.copy()
         while free.any():
             step = np.zeros(len(values))
-            step[free] = np.linalg.lstsq(*_ridged(*self._weighted(residual, slopes[:, :, free])))[0]
-            curvature = self._curvature(residual + slopes @ step, slopes)
-            spread = np.where(free, np.sqrt(np.diag(self._covariance(*curvature, free))), 0.0)
+            step[free] = np.linalg.lstsq(*add_ridge(*self.weighted(residual, slopes[:, :, free])))[0]
+            curvature = self.curvature(residual + slopes @ step, slopes)
+            spread = np.where(free, np.sqrt(np.diag(self.covariance_in_scales(*curvature, free))), 0.0)
             told = np.abs((values - begin) / self.scale + step) > CLEARLY * spread
             faint = np.where(told, 0.0, spread / np.maximum(1.0, np.abs(begin) / self.scale))
             worst = int(np.argmax(faint))
@@ -299,52 +305,61 @@ class OneStep:
             free[worst], found[worst] = False, True
         return found
 
-    def _curvature(self, residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def curvature(self, residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of the cost, in scales: about its Hessian (p, p), and each transition's part of its slope (n, p)."""
         # The loss's own second derivative: the least squares that stand for it in a step curve more.
-        curved = self.share[:, None] * (1 + (residual / self.clip) ** 2) ** -1.5
+        curved = self.share[:, None] * self.loss.second_derivative(residual)
         hessian = np.einsum("nc,ncp,ncq->pq", curved, slopes, slopes)
-        return hessian, np.einsum("nc,ncp,nc->np", self.robust(residual), slopes, residual)
+        return hessian, np.einsum("nc,ncp,nc->np", self.weights(residual), slopes, residual)
 
-    def _covariance(self, hessian: np.ndarray, scores: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """Covariance in scales where only the ``free`` ones move; infinite variances for others and without slope.
-
-        Scores are too small by what the fit took up of them: as of so many transitions fewer as there are numbers.
-        Where no more transitions count than there are numbers, nothing tells how far off these are.
-        """
-        moving = np.flatnonzero((np.diag(hessian) > 0) & free)
-        found = np.diag(np.full(len(free), np.inf))
+    def covariance_in_scales(self, hessian: np.ndarray, scores: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """Covariance (p, p) where only the ``free`` ones move, from what :meth:`curvature` returns."""
         count = 1 / np.square(self.share).sum()  # of transitions that weigh alike
-        spare = count - len(moving)
-        if spare <= 0:
-            return found
-        inverse = np.linalg.pinv(hessian[np.ix_(moving, moving)], rcond=1e-10, hermitian=True)
-        # Positive in every direction, rounding apart: Newey and West's weights are.
-        found[np.ix_(moving, moving)] = inverse @ self._scatter(scores[:, moving]) @ inverse * (count / spare)
-        found[moving, moving] = np.maximum(found[moving, moving], 0.0)
-        return found
-
-    def _scatter(self, scores: np.ndarray) -> np.ndarray:
-        """Covariance of the sum of the transitions' scores (n, p), by Newey and West's weights; (p, p)."""
-        found, past = scores.T @ scores, np.arange(len(scores))
-        for lag in range(1, LAGS + 1):
-            past = np.where(past < 0, -1, self.steps.before[past])
-            after = past >= 0
-            products = scores[after].T @ scores[past[after]]
-            found += (1 - lag / (LAGS + 1)) * (products + products.T)
-        return found
+        scatter = serial_scatter(scores, self.steps.before, LAGS)
+        return sandwich_covariance(hessian, scatter, free, count)
 
 
-def _shown(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Which parameters move the residuals ``b`` (m,) at all, by the derivatives ``a`` (m, p); (p,)."""
-    size = np.sqrt((a**2).sum(axis=0))
-    return np.asarray(size >= UNSEEN * max(float(np.sqrt((b**2).sum())), 1e-6))
+@dataclass(frozen=True)
+class OneStepLinearisation:
+    """The one-step error around phi, see :class:`~sb3_rpto.fitting.gauss_newton.Linearisation`.
 
+    :param error: of which
+    :param point: phi, (p,)
+    :param parts: by each of :data:`DIFFERENCES` the weighted least squares ``a x = b`` of a step x in scales, and which
+        parameters it may move, (p,)
+    """
 
-def _ridged(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The least squares ``a x = b`` in which directions that the data hardly tell apart share a move."""
-    return np.concatenate([a, np.diag(RIDGE * np.sqrt((a**2).sum(axis=0)))]), np.concatenate([b, np.zeros(a.shape[1])])
+    error: OneStepError
+    point: np.ndarray
+    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
+    def expected_fall(self, trust: float) -> float:
+        """Nothing is expected: all steps are tried."""
+        return 0.0
 
-def _clip(residual: np.ndarray) -> float:
-    return CLIP * max(1e-6, 1.4826 * float(np.median(np.abs(residual))))
+    def converged(self, fall: float) -> bool:
+        """Only simulations tell."""
+        return False
+
+    def best_trial(self, trusts: np.ndarray) -> Trial[np.ndarray]:
+        """The best of the steps from narrow and wide differences and of several sizes, or none."""
+        points = np.stack([self.point, *(self._step(*part, float(t)) for part in self.parts for t in trusts)])
+        costs = self.error.cost(self.error.residuals(points))
+        best = int(np.argmin(costs))
+        return Trial(points[best], float(costs[0] - costs[best]), float(trusts[0]))
+
+    def is_last(self, trial: Trial[np.ndarray]) -> bool:
+        """Whether no parameter moves by more than :data:`STILL`."""
+        return bool(np.max(np.abs(trial.point - self.point) / self.error.scale) < STILL)
+
+    def _step(self, a: np.ndarray, b: np.ndarray, shown: np.ndarray, reach: float) -> np.ndarray:
+        """Phi after the weighted least-squares step in the bounds and within a reach, (p,)."""
+        error, values = self.error, self.point
+        free = np.flatnonzero(shown & error.free)
+        step = np.zeros(len(values))
+        if len(free):
+            low, high = ((bound - values)[free] / error.scale[free] for bound in (error.lower, error.upper))
+            far = reach * np.maximum(1.0, np.abs(values[free]) / error.scale[free])
+            box = np.maximum(low, -far), np.minimum(high, far)
+            step[free] = bounded_least_squares(*add_ridge(a[:, free], b), *box) * error.scale[free]
+        return add_step(values, step, error.lower, error.upper)

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.dynamics.base import Dynamics, Prediction, Transitions, relative_error
-from sb3_rpto.dynamics.onestep import BLOWN, OneStep, Steps, as_steps
+from sb3_rpto.dynamics.onestep import BLOWN, OneStepError, Steps, as_steps
 from sb3_rpto.dynamics.simulator import check_memoryless
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation, declare
 from sb3_rpto.effects.actuation import command_limits
@@ -23,9 +23,9 @@ from sb3_rpto.effects.effect import from_json
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.model import ModelSource, load_model
 from sb3_rpto.effects.simulation import Drive
-from sb3_rpto.effects.stance import StandingEnv
+from sb3_rpto.effects.walker_reset import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
-from sb3_rpto.envs.env_copy import copy_env
+from sb3_rpto.envs.env_copy import CopyError, must_copy
 from sb3_rpto.envs.observations import StateMap, are_known, env_name, noise_of_each, single_env, whole_state
 from sb3_rpto.envs.step_fidelity import place_as_after_a_step
 from sb3_rpto.ranges import NOT_NEGATIVE, POSITIVE, THREADS, check, of_type, whole
@@ -39,8 +39,6 @@ RULES = {
     **dict.fromkeys(("declared", "effects"), of_type("be a list", list, tuple)),
 }
 
-#: A fit stops when no parameter moves by more than this share of its scale.
-STILL = 1e-6
 #: A simulator must stay finite for so many steps from states of the target, and below what MuJoCo takes for such.
 TRIAL_STATES, TRIAL_STEPS, LARGEST = 16, 20, mujoco.mjMAXVAL
 
@@ -64,7 +62,7 @@ class PhysicalDynamics(Dynamics):
 
     :param observation_space: the environment's
     :param action_space: the environment's; actions are the commands of the actuators
-    :param model: the simulator's model: the path or text of an MJCF, or as :func:`sb3_rpto.effects.model.load_model`
+    :param mj_model: the simulator's model: the path or text of an MJCF, or as :func:`sb3_rpto.effects.model.load_model`
         takes it
     :param recover: states from observations, see :func:`sb3_rpto.envs.observations.state_map`; None: observations are
         states, qpos and then qvel, NaN where one is not known
@@ -94,7 +92,7 @@ class PhysicalDynamics(Dynamics):
         observation_space: spaces.Box,
         action_space: spaces.Box,
         *,
-        model: ModelSource | PlainModel,
+        mj_model: ModelSource | PlainModel,
         recover: StateMap | None = None,
         frame_skip: int = 1,
         declared: Sequence[str] = (),
@@ -107,7 +105,7 @@ class PhysicalDynamics(Dynamics):
     ) -> None:
         super().__init__(observation_space, action_space)
         check(RULES, locals())
-        model = model.compile() if isinstance(model, PlainModel) else load_model(model)[1]
+        model = mj_model.compile() if isinstance(mj_model, PlainModel) else load_model(mj_model)[1]
         recover = whole_state(model.nq, model.nv) if recover is None else recover
         if action_space.shape != (model.nu,):
             raise ValueError(f"action_space has shape {action_space.shape}, the model {model.nu} actuators")
@@ -116,7 +114,7 @@ class PhysicalDynamics(Dynamics):
                 f"observation_space has shape {observation_space.shape}, and states are recovered from {recover.width} "
                 "numbers; give recover= for observations that are not qpos and qvel"
             )
-        self.model, self.recover, self.frame_skip = model, recover, frame_skip
+        self.mj_model, self.recover, self.frame_skip = model, recover, frame_skip
         self.max_step, self.max_steps, self.randomise = max_step, max_steps, randomise
         self.threads = threads
         #: whether the last fit came to its end, or phi would have moved on with more steps
@@ -125,8 +123,8 @@ class PhysicalDynamics(Dynamics):
             None if observation_noise is None else noise_of_each(observation_noise, recover, "observation_noise")
         )
         self._twin: CorrectedEnv | None = None
-        self._unseen: tuple[str, ...] = ()
-        self._entangled: tuple[str, ...] = ()
+        self._vague: tuple[str, ...] = ()
+        self._confounded: tuple[str, ...] = ()
         known: list[Effect] = [*declare(model, declared)]
         every = [*known, *map(from_json, effects)]
         labels = [effect.label for effect in every]
@@ -137,9 +135,9 @@ class PhysicalDynamics(Dynamics):
 
     def _adopt(self, effects: Sequence[Effect], covariance: np.ndarray | None = None) -> None:
         """Let phi be the values of these effects, with their covariance (p, p); None: all zero."""
-        self.simulation = Simulation(self.model, effects, self.threads)
-        largest = np.abs(self.model.actuator_ctrlrange).max(axis=1, initial=0)[self.model.actuator_ctrladr]
-        gears = np.abs(self.model.actuator_gear[:, 0]) * largest
+        self.simulation = Simulation(self.mj_model, effects, self.threads)
+        largest = np.abs(self.mj_model.actuator_ctrlrange).max(axis=1, initial=0)[self.mj_model.actuator_ctrladr]
+        gears = np.abs(self.mj_model.actuator_gear[:, 0]) * largest
         strongest = float(gears.max(initial=0.0))
         scales = Scales(torque=strongest if strongest > 0 else 1.0)
         parameters = [p for e in self.simulation.effects for p in e.parameters]
@@ -218,7 +216,9 @@ class PhysicalDynamics(Dynamics):
         :param actions: of the transitions from there on, (n, length, nu)
         """
         states = self.recover(observations.astype(np.float64))
-        commands = np.repeat(np.clip(actions.astype(np.float64), *command_limits(self.model)), self.frame_skip, axis=1)
+        commands = np.repeat(
+            np.clip(actions.astype(np.float64), *command_limits(self.mj_model)), self.frame_skip, axis=1
+        )
         qpos, qvel = np.nan_to_num(states.qpos), np.nan_to_num(states.qvel)
         values = np.tile(self.values, (len(observations), 1))
         self.simulation.undo_sensors(values, qpos, qvel)
@@ -273,9 +273,10 @@ class PhysicalDynamics(Dynamics):
         :raises ValueError: it cannot be copied, or set to a state, or its answer to a step does not follow from the
             state before it
         """
-        twin = copy_env(single_env(env))
-        if twin is None:
-            raise ValueError(f"{env} cannot be copied; give dynamics='physical' an environment that can")
+        try:
+            twin = must_copy(single_env(env))
+        except CopyError as error:
+            raise ValueError(f"{env} cannot be copied ({error}), which dynamics='physical' needs") from error
         for name in ("set_state", "_get_obs"):
             if not callable(getattr(twin.unwrapped, name, None)):
                 raise ValueError(
@@ -357,7 +358,7 @@ class PhysicalDynamics(Dynamics):
 
     def _steps(self, data: Transitions, chosen: np.ndarray | None = None) -> Steps:
         idle = any(effect.idle for effect in self.simulation.effects)
-        return as_steps(data, self.recover, self.model, self.frame_skip, chosen, idle)
+        return as_steps(data, self.recover, self.mj_model, self.frame_skip, chosen, idle)
 
     # ------------------------------------------------------------------ the fit
 
@@ -384,14 +385,8 @@ class PhysicalDynamics(Dynamics):
         if not steps.compared.any() or not len(self.names):
             return {"steps": 0.0, **counts}
         begin, most = self.values.copy(), self.max_steps if max_steps is None else max_steps
-        problem = OneStep(self.simulation, self.scale, self.simulation.lower, self.simulation.upper, steps, weights)
-        problem.hold_what_is_not_determined(begin)
-        values, taken = self._descend(problem, begin, most)
-        vague = problem.vague(values, begin)
-        while (values != begin)[vague].any():  # what the data do not tell has moved: without it, from the start
-            problem.left |= vague
-            values, taken = self._descend(problem, begin, most)
-            vague = problem.vague(values, begin)
+        error = OneStepError(self.simulation, self.scale, self.simulation.lower, self.simulation.upper, steps, weights)
+        values, taken = error.fit(begin, self.max_step, most)
         self._values.copy_(th.as_tensor(values))
         self.settled = taken < most
         if taken and not self.runs_on(data):
@@ -402,46 +397,33 @@ class PhysicalDynamics(Dynamics):
                 stacklevel=3,
             )
             return {"steps": 0.0, **counts}
-        problem.left |= vague
-        self._covariance.copy_(th.as_tensor(problem.covariance(values)))
-        self._name_unseen(problem.left)
-        self._name_entangled(problem.entangled, problem.held)
+        self._covariance.copy_(th.as_tensor(error.covariance(values)))
+        self._name_vague(error.vague)
+        self._name_confounded(error.confounded, error.fixed)
         return {"steps": float(taken), **counts}
 
-    def _descend(self, problem: OneStep, values: np.ndarray, most: int) -> tuple[np.ndarray, int]:
-        """At most ``most`` trusted steps from ``values`` on: where they lead, and how many they were."""
-        for taken in range(most):
-            moved = problem.step(values, self.max_step)
-            if moved is None:
-                return values, taken
-            change = float(np.max(np.abs(moved - values) / self.scale))
-            values = moved
-            if change < STILL:
-                return values, taken + 1
-        return values, most
-
-    def _name_unseen(self, unseen: np.ndarray) -> None:
+    def _name_vague(self, vague: np.ndarray) -> None:
         """Warn once of parameters that the data do not show, or too faintly."""
-        names = self._which(unseen)
+        names = self._which(vague)
         _warn_of_new(
             names,
-            self._unseen,
+            self._vague,
             f"the target's data do not show {', '.join(names)}: left at what it was; do not declare it, or move so "
             "that it matters",
         )
-        self._unseen = tuple(dict.fromkeys([*self._unseen, *names]))  # with more data they may come and go
+        self._vague = tuple(dict.fromkeys([*self._vague, *names]))  # with more data they may come and go
 
-    def _name_entangled(self, entangled: np.ndarray, held: np.ndarray) -> None:
+    def _name_confounded(self, confounded: np.ndarray, fixed: np.ndarray) -> None:
         """Warn once of parameters that the data do not tell apart."""
-        names = self._which(entangled)
+        names = self._which(confounded)
         _warn_of_new(
             names,
-            self._entangled,
-            f"the target's data do not tell {', '.join(names)} apart: {', '.join(self._which(held))} left at what it "
+            self._confounded,
+            f"the target's data do not tell {', '.join(names)} apart: {', '.join(self._which(fixed))} left at what it "
             "was, the rest is fitted to that and has no standard error; declare fewer of them, or add what is known of "
             "one",
         )
-        self._entangled = names
+        self._confounded = names
 
     def _which(self, marked: np.ndarray) -> tuple[str, ...]:
         return tuple(self.names[i] for i in np.flatnonzero(marked))

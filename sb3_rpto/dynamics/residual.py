@@ -169,7 +169,7 @@ class ResidualDynamics(Dynamics):
         """Index of the newest transitions whose states are known, (m,); of the others the simulator knows nothing."""
         oldest = max(0, len(data) - MAX_TRANSITIONS)
         newest = data.take(slice(oldest, None))
-        rows = as_steps(newest, self.physical.recover, self.physical.model, self.physical.frame_skip).rows
+        rows = as_steps(newest, self.physical.recover, self.physical.mj_model, self.physical.frame_skip).rows
         return th.as_tensor(oldest + rows, device=data.observations.device)
 
     def _correction(self, observations: th.Tensor, actions: th.Tensor, deterministic: bool) -> th.Tensor:

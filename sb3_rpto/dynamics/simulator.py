@@ -10,7 +10,8 @@ from gymnasium.wrappers import ClipAction
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_rpto.effects.mjcf import PlainModel
-from sb3_rpto.effects.model import differing, load_model
+from sb3_rpto.effects.model import load_model
+from sb3_rpto.effects.model_numbers import differing
 from sb3_rpto.effects.wrapper import beyond_model, stepped_by
 from sb3_rpto.envs.observations import (
     StateMap,
@@ -40,7 +41,7 @@ def physical_config(env: gym.Env | VecEnv) -> dict[str, Any]:
         )
     spec, model = load_model(single)[0], mujoco_model(single)
     plain = model.__copy__() if spec is None else PlainModel.of(spec, model)  # nothing tells the MJCF of some
-    return {"model": plain, "recover": recover, "frame_skip": int(single.unwrapped.frame_skip)}
+    return {"mj_model": plain, "recover": recover, "frame_skip": int(single.unwrapped.frame_skip)}
 
 
 def check_source(env: gym.Env | VecEnv) -> StateMap:

@@ -8,11 +8,11 @@ from sb3_rpto.effects import (  # noqa: F401  (they register their effects)
     sensors,
     zero_order_hold,
 )
+from sb3_rpto.effects.batch import SimulationBatch
 from sb3_rpto.effects.declared import Declared, declare, parameter_names
 from sb3_rpto.effects.effect import LIBRARY, Effect, Parameter, Scales, from_json, register
 from sb3_rpto.effects.library import candidates
 from sb3_rpto.effects.simulation import Drive, Simulation
-from sb3_rpto.effects.world import World
 
 __all__ = [
     "LIBRARY",
@@ -22,7 +22,7 @@ __all__ = [
     "Parameter",
     "Scales",
     "Simulation",
-    "World",
+    "SimulationBatch",
     "candidates",
     "declare",
     "from_json",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.world import World
+from sb3_rpto.effects.batch import SimulationBatch
 
 #: Actuators whose force follows the command with a time constant, ``dynprm[0]``, and all that have a state of their own
 #: which does.
@@ -96,73 +96,73 @@ def driven(model: mujoco.MjModel) -> set[int]:
     return on.union(*(joints_of_tendon(model, a) or () for a in tendons))
 
 
-def motor_torque(world: World, actuator: int, dof: int, adr: int) -> np.ndarray:
+def motor_torque(batch: SimulationBatch, actuator: int, dof: int, adr: int) -> np.ndarray:
     r"""Generalised force of a memoryless actuator at its joint, N·m or N, (n,).
 
     :math:`\tau = G\,\mathrm{clip}(g\,\mathrm{clip}(u) + b_0 + b_1 l + b_2 \dot l)` with gear :math:`G`, length
     :math:`l = G q` and gain :math:`g = g_0 + g_1 l + g_2 \dot l` (MuJoCo documentation, *Actuation model*).
 
-    :param world: commands and state of the substep to come
+    :param batch: commands and state of the substep to come
     :param actuator: id of the actuator, see :func:`memoryless`
     :param dof: the joint's address in qvel
     :param adr: its address in qpos
     """
-    model = world.model
+    model = batch.model
     if _is_off(model, actuator):
-        return np.zeros(world.n)
-    gear = world.field("actuator_gear")[:, actuator, 0]
-    length, speed = gear * world.qpos[:, adr], gear * world.qvel[:, dof]
+        return np.zeros(batch.n)
+    gear = batch.field("actuator_gear")[:, actuator, 0]
+    length, speed = gear * batch.qpos[:, adr], gear * batch.qvel[:, dof]
     ctrl = int(model.actuator_ctrladr[actuator])
-    u = world.ctrl[:, ctrl]
+    u = batch.ctrl[:, ctrl]
     if model.actuator_ctrllimited[ctrl] and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
-        limits = world.field("actuator_ctrlrange")[:, ctrl]
+        limits = batch.field("actuator_ctrlrange")[:, ctrl]
         u = np.clip(u, limits[:, 0], limits[:, 1])
-    gain = world.field("actuator_gainprm")[:, actuator]
+    gain = batch.field("actuator_gainprm")[:, actuator]
     affine = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_AFFINE
     force = (_affine(gain, length, speed) if affine else gain[:, 0]) * u
     if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
-        force = force + _affine(world.field("actuator_biasprm")[:, actuator], length, speed)
+        force = force + _affine(batch.field("actuator_biasprm")[:, actuator], length, speed)
     if model.actuator_forcelimited[actuator]:
-        limits = world.force_range(actuator)
+        limits = batch.force_range(actuator)
         force = np.clip(force, limits[:, 0], limits[:, 1])
     return gear * force
 
 
-def joint_torque(world: World, actuators: list[int] | None, dof: int, adr: int) -> np.ndarray:
+def joint_torque(batch: SimulationBatch, actuators: list[int] | None, dof: int, adr: int) -> np.ndarray:
     """Sum of the actuators' generalised forces at a joint, (n,), within what its ``actuatorfrcrange`` lets through.
 
-    :param actuators: from :func:`motors`; None: MuJoCo's own sum, of the last :meth:`World.evaluate`
+    :param actuators: from :func:`motors`; None: MuJoCo's own sum, of the last :meth:`SimulationBatch.evaluate`
     """
     if actuators is None:
-        return world.actuation[:, dof] - world.loss[:, dof]
-    return _through(world, _sum(world, actuators, dof, adr) - world.loss[:, dof], dof)
+        return batch.actuation[:, dof] - batch.loss[:, dof]
+    return _through(batch, _sum(batch, actuators, dof, adr) - batch.loss[:, dof], dof)
 
 
-def count_loss(world: World, actuators: list[int], dof: int, adr: int, loss: np.ndarray) -> None:
+def count_loss(batch: SimulationBatch, actuators: list[int], dof: int, adr: int, loss: np.ndarray) -> None:
     """Count as lost in this substep (``world.loss``, (n,)) what one of a joint's actuators does not give.
 
     The joint misses it (``world.missed``), but for what its limit takes anyway.
 
     :param actuators: all that act on the joint
     """
-    before = world.loss[:, dof].copy()
-    world.loss[:, dof] += loss
-    if world.model.jnt_actfrclimited[world.model.dof_jntid[dof]]:
-        total = _sum(world, actuators, dof, adr) - before
-        loss = _through(world, total, dof) - _through(world, total - loss, dof)
-    world.missed[:, dof] += loss
+    before = batch.loss[:, dof].copy()
+    batch.loss[:, dof] += loss
+    if batch.model.jnt_actfrclimited[batch.model.dof_jntid[dof]]:
+        total = _sum(batch, actuators, dof, adr) - before
+        loss = _through(batch, total, dof) - _through(batch, total - loss, dof)
+    batch.missed[:, dof] += loss
 
 
-def _sum(world: World, actuators: list[int], dof: int, adr: int) -> np.ndarray:
-    return sum((motor_torque(world, a, dof, adr) for a in actuators), np.zeros(world.n))
+def _sum(batch: SimulationBatch, actuators: list[int], dof: int, adr: int) -> np.ndarray:
+    return sum((motor_torque(batch, a, dof, adr) for a in actuators), np.zeros(batch.n))
 
 
-def _through(world: World, torque: np.ndarray, dof: int) -> np.ndarray:
+def _through(batch: SimulationBatch, torque: np.ndarray, dof: int) -> np.ndarray:
     """What reaches a joint of its actuators' sum: MuJoCo clips it to the joint's ``actuatorfrcrange``."""
-    joint = world.model.dof_jntid[dof]
-    if not world.model.jnt_actfrclimited[joint]:
+    joint = batch.model.dof_jntid[dof]
+    if not batch.model.jnt_actfrclimited[joint]:
         return torque
-    limits = world.field("jnt_actfrcrange")[:, joint]
+    limits = batch.field("jnt_actfrcrange")[:, joint]
     return np.clip(torque, limits[:, 0], limits[:, 1])
 
 

@@ -3,11 +3,11 @@
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.batch import SimulationBatch, add
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.inertia import from_tensor, rotations, spread, to_tensor
 from sb3_rpto.effects.length import held_by_constraint, link_length, write_length
 from sb3_rpto.effects.names import object_names
-from sb3_rpto.effects.world import World, add
 
 
 @register
@@ -23,10 +23,10 @@ class MassScale(Effect):
     same = ("mass",)
     offered = False
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Scale the body's mass and inertia."""
-        world.field("body_mass")[:, self.index] *= 1 + x[:, 0]
-        world.field("body_inertia")[:, self.index] *= 1 + x
+        batch.field("body_mass")[:, self.index] *= 1 + x[:, 0]
+        batch.field("body_inertia")[:, self.index] *= 1 + x
 
 
 @register
@@ -45,9 +45,9 @@ class InertiaScale(Effect):
     same = ("inertia",)
     offered = False
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Scale the body's inertia."""
-        world.field("body_inertia")[:, self.index] *= 1 + x
+        batch.field("body_inertia")[:, self.index] *= 1 + x
 
 
 @register
@@ -68,19 +68,19 @@ class Payload(Effect):
     native = "inertial"
     excite = "accelerations, and poses at which gravity pulls"
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Change mass, centre and inertia where there is a payload."""
         heavier = x[:, 0] > 0
         if not heavier.any():
             return
         added, along = x[heavier].T
-        mass, centre = world.field("body_mass"), world.field("body_ipos")
-        inertia, frame = world.field("body_inertia"), world.field("body_iquat")
+        mass, centre = batch.field("body_mass"), batch.field("body_ipos")
+        inertia, frame = batch.field("body_inertia"), batch.field("body_iquat")
         m, c = mass[heavier, self.index], centre[heavier, self.index]
         p = along[:, None] * c
         total = m + added
         new = (m[:, None] * c + added[:, None] * p) / total[:, None]
-        if not world.model.body_ipos[self.index].any():
+        if not batch.model.body_ipos[self.index].any():
             # At the centre of mass a point only weighs; MuJoCo keeps some such bodies in a simplified form.
             mass[heavier, self.index] = total
             return
@@ -117,9 +117,9 @@ class ComOffset(Effect):
         moves = self.on in super().places(model)
         return "MuJoCo holds it in a form that keeps the centre where it is" if moves else super().why_not(model)
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Move the centre of mass."""
-        world.field("body_ipos")[:, self.index] += x
+        batch.field("body_ipos")[:, self.index] += x
 
 
 @register
@@ -134,9 +134,9 @@ class Armature(Effect):
     excite = "large accelerations"
     same = ("armature",)
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add to armature."""
-        add(world.field("dof_armature")[:, self.dof], x[:, 0])
+        add(batch.field("dof_armature")[:, self.dof], x[:, 0])
 
 
 @register
@@ -172,9 +172,9 @@ class LinkLength(Effect):
         held = held_by_constraint(model, self.index)
         return f"{held} names the body; tie it by sites (site1=)" if held else "the body has no capsule to stretch"
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Stretch the link."""
-        write_length(world, self.index, self.nominal * (1 + x[:, 0]), self.nominal)
+        write_length(batch, self.index, self.nominal * (1 + x[:, 0]), self.nominal)
 
 
 @register
@@ -200,9 +200,9 @@ class GravityTilt(Effect):
         off = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
         return [] if off or not model.opt.gravity.any() else [""]
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Turn gravity."""
-        gravity = world.field("opt.gravity")
+        gravity = batch.field("opt.gravity")
         gravity[:] = (rotations(x[:, 0], x[:, 1]) * gravity[:, None]).sum(axis=2)
 
 
@@ -224,9 +224,9 @@ class GravityScale(Effect):
         """The world, where there is gravity."""
         return GravityTilt.places(model)
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Scale gravity."""
-        world.field("opt.gravity")[:] *= 1 + x
+        batch.field("opt.gravity")[:] *= 1 + x
 
 
 @register
@@ -249,9 +249,9 @@ class Wind(Effect):
         """The world, where there is a fluid."""
         return [""] if model.opt.density > 0 or model.opt.viscosity > 0 else []
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add to the wind."""
-        world.field("opt.wind")[:] += x
+        batch.field("opt.wind")[:] += x
 
 
 @register
@@ -275,9 +275,9 @@ class ExternalForce(Effect):
         base = (model.body_weldid[model.body_parentid] == 0) & (model.body_dofnum > 1)
         return [name for name in super().places(model) if base[names.index(name)]]
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add the force."""
-        world.pull[:, self.index] += x
+        batch.pull[:, self.index] += x
 
 
 @register
@@ -306,10 +306,10 @@ class Fluid(Effect):
     excite = "fast motion"
     same = ("density", "viscosity")
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add to density and viscosity."""
         for column, name in enumerate(("opt.density", "opt.viscosity")):
-            add(world.field(name), x[:, column].reshape(world.field(name).shape))
+            add(batch.field(name), x[:, column].reshape(batch.field(name).shape))
 
 
 @register
@@ -334,9 +334,9 @@ class GeomFriction(Effect):
         names = object_names(model, "geom")
         return [names[g] for g in range(model.ngeom) if any(_may_slip(model, g, h) for h in range(model.ngeom))]
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Change the coefficient."""
-        friction = world.field("geom_friction")[:, self.index, 0]
+        friction = batch.field("geom_friction")[:, self.index, 0]
         friction[:] = np.maximum(friction + x[:, 0], 0.0)
 
 
@@ -369,9 +369,9 @@ class ContactSoftness(Effect):
         geoms = [g for g in range(model.ngeom) if still[g]]
         return [names[g] for g in geoms if any(may_touch(model, g, h) for h in range(model.ngeom))]
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Scale the geom's numbers."""
-        world.field("geom_solref")[:, self.index] *= 1 + x
+        batch.field("geom_solref")[:, self.index] *= 1 + x
 
 
 def may_touch(model: mujoco.MjModel, g: int, h: int) -> bool:

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects.actuation import GAINS, on_voltage, servo_of
+from sb3_rpto.effects.batch import SimulationBatch
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.names import object_id, object_names
-from sb3_rpto.effects.world import World
 
 LONGEST_DELAY = 0.2  # s; a longer delay is a fault of the log
 _SLOWEST = 0.25  # s; of a slower lag the past that windows keep says too little
@@ -143,10 +143,10 @@ class CommandGain(Effect):
         every = super().places(model)
         return [n for n in every if model.actuator_gaintype[ids[n]] in GAINS or on_voltage(model, ids[n])]
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Scale the gain."""
-        gain = world.field("actuator_gainprm")[:, self.index]
-        if on_voltage(world.model, self.index):
+        gain = batch.field("actuator_gainprm")[:, self.index]
+        if on_voltage(batch.model, self.index):
             gain[:, :2] /= (1 + x) ** [2, 1]  # resistance, motor constant
         else:
             gain[:, :3] *= 1 + x
@@ -173,10 +173,10 @@ class ServoGain(Effect):
         every = super().places(model)
         return [name for name in every if servo_of(model, object_id(model, "actuator", name)) == cls.regulates]
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Scale the gain and what it takes back."""
-        world.field("actuator_gainprm")[:, self.index, 0] *= 1 + x[:, 0]
-        world.field("actuator_biasprm")[:, self.index, self.takes_back] *= 1 + x[:, 0]
+        batch.field("actuator_gainprm")[:, self.index, 0] *= 1 + x[:, 0]
+        batch.field("actuator_biasprm")[:, self.index, self.takes_back] *= 1 + x[:, 0]
 
 
 @register
@@ -200,9 +200,9 @@ class ServoDamping(Effect):
         servos = ServoGain.places(model)
         return [name for name in servos if model.actuator_biasprm[object_id(model, "actuator", name), 2]]
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Scale the feedback of the speed."""
-        world.field("actuator_biasprm")[:, self.index, 2] *= 1 + x[:, 0]
+        batch.field("actuator_biasprm")[:, self.index, 2] *= 1 + x[:, 0]
 
 
 @register

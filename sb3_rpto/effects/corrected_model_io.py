@@ -15,15 +15,16 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.batch import LiveSimulation
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import LIBRARY, Effect, from_json
 from sb3_rpto.effects.mjcf import restore, rounded, write_mjcf
-from sb3_rpto.effects.model import ModelSource, differing, file_of, load_model, same_layout
+from sb3_rpto.effects.model import ModelSource, file_of, load_model
+from sb3_rpto.effects.model_numbers import differing, same_layout
 from sb3_rpto.effects.names import near
 from sb3_rpto.effects.simulation import Simulation, prepare
-from sb3_rpto.effects.stance import StandingEnv, nominal_heights
 from sb3_rpto.effects.units import units_at
-from sb3_rpto.effects.world import LiveWorld
+from sb3_rpto.effects.walker_reset import StandingEnv, nominal_heights
 from sb3_rpto.effects.wrapper import CorrectedEnv, active, own
 from sb3_rpto.files import write_together
 
@@ -40,7 +41,7 @@ class Corrected:
     :param model: with the numbers of every effect that ``model.xml`` holds
     :param effects: all effects, as changes of the **nominal** model; those for which :func:`carried_by` says
         ``"mjcf"`` are in ``model`` already
-    :param heights: at which the nominal robot stands, see :func:`~sb3_rpto.effects.stance.nominal_heights`
+    :param heights: at which the nominal robot stands, see :func:`~sb3_rpto.effects.walker_reset.nominal_heights`
     """
 
     model: mujoco.MjModel
@@ -88,7 +89,7 @@ def correct(model: mujoco.MjModel, effects: Sequence[Effect]) -> mujoco.MjModel:
     """
     model = model.__copy__()
     numeric = [effect for effect in own(effects, model) if carried_by(effect) == "mjcf"]
-    prepare(LiveWorld(model, mujoco.MjData(model)), active(numeric))
+    prepare(LiveSimulation(model, mujoco.MjData(model)), active(numeric))
     return model
 
 

@@ -9,10 +9,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.batch import SimulationBatch
 from sb3_rpto.effects.effect import Effect, Parameter, Scales
 from sb3_rpto.effects.model_parameters import NUMBERS, OPTIONS, Number
 from sb3_rpto.effects.names import SCALAR_JOINTS, near, object_id, object_names
-from sb3_rpto.effects.world import World
 
 OBJECTS = ("joint", "body", "geom", "actuator")
 #: So many plausible sizes above its nominal value, what holds a joint still would do so by several times its torque.
@@ -147,12 +147,12 @@ class Declared(Effect):
             return parameter.upper
         return self.nominal + REACH * max(0.1 * self.nominal, self._how.size(scales))
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Write the parameter's field."""
         if self.soft:
-            world.field("dof_frictionloss")[:, self.dof] = x[:, 0]
+            batch.field("dof_frictionloss")[:, self.dof] = x[:, 0]
         else:
-            self._how.write(world, self.index, x[:, 0], self.nominal)
+            self._how.write(batch, self.index, x[:, 0], self.nominal)
 
 
 def _find(model: mujoco.MjModel, name: str) -> tuple[str, int, Number]:

@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Literal, get_args
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.batch import SimulationBatch
 from sb3_rpto.effects.names import SCALAR_JOINTS, near, object_id, object_names
-from sb3_rpto.effects.world import World
 
 Place = Literal["joint", "actuator", "body", "geom", "world", "sensor"]
 #: What an effect acts by; it overrides at least one.
@@ -256,10 +256,10 @@ class Effect:
         places = self.places(model)
         return f"it can on {', '.join(places[:12])}{' …' if len(places) > 12 else ''}" if places else "it can on none"
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Change fields of the model, once before a rollout."""
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add to ``world.force`` or ``world.friction``, before every substep."""
 
     def command(self, u: np.ndarray, x: np.ndarray, memory: dict[str, Any], dt: float) -> np.ndarray:

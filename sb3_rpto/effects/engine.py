@@ -46,7 +46,7 @@ def quiet() -> Iterator[None]:
 
 @contextmanager
 def untimed() -> Iterator[None]:
-    """Keep MuJoCo from reading the clock around each stage of a step: a third of a small model's step is that.
+    """Keep MuJoCo from reading the clock around each stage of a step: that is a fifth of a trace of a small model.
 
     ``MjData.timer`` counts no time meanwhile, in no thread. Nothing changes where MuJoCo's library is not found.
     """

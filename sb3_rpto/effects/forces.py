@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects.actuation import count_loss, memoryless, motor_torque, motors
+from sb3_rpto.effects.batch import SimulationBatch, add
 from sb3_rpto.effects.effect import Effect, Parameter, register
 from sb3_rpto.effects.names import SCALAR_JOINTS, hinges, object_names
-from sb3_rpto.effects.world import World, add
 
 #: Half of what is left between stops that meet, for one unit of their place: six digits, as MJCF has, tell them apart.
 GAP = 1e-5
@@ -33,10 +33,10 @@ class TorqueRipple(Effect):
         """Hinges."""
         return hinges(model)
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add the torque."""
-        angle = x[:, 2] * world.qpos[:, self.adr]
-        world.force[:, self.dof] += x[:, 0] * np.cos(angle) + x[:, 1] * np.sin(angle)
+        angle = x[:, 2] * batch.qpos[:, self.adr]
+        batch.force[:, self.dof] += x[:, 0] * np.cos(angle) + x[:, 1] * np.sin(angle)
 
 
 @register
@@ -52,9 +52,9 @@ class TorqueOffset(Effect):
     equation = "offset"
     excite = "rest or slow motion at several poses"
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add the torque."""
-        world.force[:, self.dof] += x[:, 0]
+        batch.force[:, self.dof] += x[:, 0]
 
 
 @register
@@ -82,10 +82,10 @@ class Spring(Effect):
         names = object_names(model, "joint")
         return [n for n in super().places(model) if not model.jnt_stiffnesspoly[names.index(n)].any()]
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add to the joint's own spring."""
-        stiffness = world.field("jnt_stiffness")[:, self.index]
-        reference = world.field("qpos_spring")[:, self.adr]
+        stiffness = batch.field("jnt_stiffness")[:, self.index]
+        reference = batch.field("qpos_spring")[:, self.adr]
         total = np.maximum(stiffness + x[:, 0], 0.0)
         # With no stiffness at all the reference means nothing and stays.
         share = np.divide(x[:, 0], total, out=np.zeros_like(total), where=total > 0)
@@ -114,9 +114,9 @@ class EndStop(Effect):
         names = object_names(model, "joint")
         return [n for n in super().places(model) if model.jnt_limited[names.index(n)]]
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Move the limits; those that would cross meet half-way, but for the gap that an MJCF must leave."""
-        limits = world.field("jnt_range")[:, self.index]
+        limits = batch.field("jnt_range")[:, self.index]
         limits += x
         middle = limits.mean(axis=1, keepdims=True)
         met = middle + GAP * np.maximum(1.0, np.abs(middle)) * [-1, 1]
@@ -165,15 +165,15 @@ class DCMotor(Effect):
         """As in :class:`Effect`."""
         return "it needs a motor on a hinge or slide, without memory"
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Take away what the motor cannot give."""
-        torque = motor_torque(world, self.index, self.dof, self.adr)
-        speed = world.qvel[:, self.dof]
+        torque = motor_torque(batch, self.index, self.dof, self.adr)
+        speed = batch.qvel[:, self.dof]
         room = np.maximum(1 - x[:, 1:] * np.maximum(np.stack([-speed, speed], axis=1), 0.0), 0.0)
         most = np.divide(room, x[:, :1], out=np.where(room > 0, np.inf, 0.0), where=x[:, :1] > 0)
         limits = most * [-1, 1]  # of the torque that pulls the joint back, and of that which drives it on
-        count_loss(world, self.beside, self.dof, self.adr, torque - np.clip(torque, limits[:, 0], limits[:, 1]))
-        gear = world.field("actuator_gear")[:, self.index, :1]
+        count_loss(batch, self.beside, self.dof, self.adr, torque - np.clip(torque, limits[:, 0], limits[:, 1]))
+        gear = batch.field("actuator_gear")[:, self.index, :1]
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = np.sort(np.where(gear == 0, [-np.inf, np.inf], limits / gear), axis=1)
-        world.room[:, self.index] = np.clip(ends, world.room[:, self.index, :1], world.room[:, self.index, 1:])
+        batch.room[:, self.index] = np.clip(ends, batch.room[:, self.index, :1], batch.room[:, self.index, 1:])

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects.actuation import driven, joint_torque, motors
+from sb3_rpto.effects.batch import SimulationBatch, add
 from sb3_rpto.effects.effect import Effect, Parameter, Scales, register
 from sb3_rpto.effects.names import hinges, object_names
-from sb3_rpto.effects.world import World, add
 
 
 def _torque(scales: Scales) -> float:
@@ -28,10 +28,10 @@ class CoulombFriction(Effect):
     excite = "motion that often reverses, at small and at large speed"
     same = ("frictionloss",)
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add to frictionloss."""
-        world.rough(self.dof)
-        add(world.field("dof_frictionloss")[:, self.dof], x[:, 0])
+        batch.rough(self.dof)
+        add(batch.field("dof_frictionloss")[:, self.dof], x[:, 0])
 
 
 @register
@@ -47,9 +47,9 @@ class SoftFriction(CoulombFriction):
     equation = "-level sign(qd), giving way over solref"
     offered = False
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add to frictionloss, and leave its constraint as it is."""
-        add(world.field("dof_frictionloss")[:, self.dof], x[:, 0])
+        add(batch.field("dof_frictionloss")[:, self.dof], x[:, 0])
 
 
 @register
@@ -69,10 +69,10 @@ class StribeckFriction(Effect):
     equation = "-(level + extra exp(-(qd/speed)^2)) sign(qd)"
     excite = "slow motion and motion that starts from rest"
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Raise the level of dry friction."""
-        v = world.qvel[:, self.dof] / x[:, 2]
-        world.friction[:, self.dof] += x[:, 1] + x[:, 0] * np.exp(-(v**2))
+        v = batch.qvel[:, self.dof] / x[:, 2]
+        batch.friction[:, self.dof] += x[:, 1] + x[:, 0] * np.exp(-(v**2))
 
 
 @register
@@ -89,9 +89,9 @@ class ViscousFriction(Effect):
     excite = "motion at several speeds"
     same = ("damping",)
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add to damping."""
-        add(world.field("dof_damping")[:, self.dof], x[:, 0])
+        add(batch.field("dof_damping")[:, self.dof], x[:, 0])
 
 
 @register
@@ -108,9 +108,9 @@ class QuadraticDrag(Effect):
     native = "damping"
     excite = "fast motion"
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add to the damping polynomial."""
-        world.field("dof_dampingpoly")[:, self.dof, 0] += x[:, 0]
+        batch.field("dof_dampingpoly")[:, self.dof, 0] += x[:, 0]
 
 
 @register
@@ -130,10 +130,10 @@ class AsymmetricDamping(Effect):
     equation = "-forward max(qd, 0) - backward min(qd, 0)"
     excite = "motion at several speeds in both directions"
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add the torque."""
-        v = world.qvel[:, self.dof]
-        world.force[:, self.dof] -= x[:, 0] * np.maximum(v, 0.0) + x[:, 1] * np.minimum(v, 0.0)
+        v = batch.qvel[:, self.dof]
+        batch.force[:, self.dof] -= x[:, 0] * np.maximum(v, 0.0) + x[:, 1] * np.minimum(v, 0.0)
 
 
 class _LoadDependent(Effect):
@@ -155,9 +155,9 @@ class _LoadDependent(Effect):
         self.motors = motors(model, self.index)
         self.asks_simulator = self.motors is None
 
-    def torque(self, world: World) -> np.ndarray:
+    def torque(self, batch: SimulationBatch) -> np.ndarray:
         """The motors' torque at the joint, (n,)."""
-        return joint_torque(world, self.motors, self.dof, self.adr)
+        return joint_torque(batch, self.motors, self.dof, self.adr)
 
 
 @register
@@ -168,9 +168,9 @@ class LoadFriction(_LoadDependent):
     parameters = (Parameter("mu", "", 0.03, lower=0.0, upper=1.0),)
     equation = "-mu |tau_motor| sign(qd)"
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Raise the level of dry friction."""
-        world.friction[:, self.dof] += x[:, 0] * np.abs(self.torque(world))
+        batch.friction[:, self.dof] += x[:, 0] * np.abs(self.torque(batch))
 
 
 @register
@@ -189,11 +189,11 @@ class DirectionalLoadFriction(_LoadDependent):
     equation = "-(mu_driving if tau_motor qd > 0 else mu_driven) |tau_motor| sign(qd)"
     excite = "accelerating and braking with large torques"
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Raise the level of dry friction."""
-        torque = self.torque(world)
-        mu = np.where(torque * world.qvel[:, self.dof] > 0, x[:, 0], x[:, 1])
-        world.friction[:, self.dof] += mu * np.abs(torque)
+        torque = self.torque(batch)
+        mu = np.where(torque * batch.qvel[:, self.dof] > 0, x[:, 0], x[:, 1])
+        batch.friction[:, self.dof] += mu * np.abs(torque)
 
 
 @register
@@ -218,7 +218,7 @@ class PositionFriction(Effect):
         """Hinges."""
         return hinges(model)
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Raise the level of dry friction."""
-        q = world.qpos[:, self.adr]
-        world.friction[:, self.dof] += x[:, 0] * (1 + np.cos(q - x[:, 1])) / 2
+        q = batch.qpos[:, self.adr]
+        batch.friction[:, self.dof] += x[:, 0] * (1 + np.cos(q - x[:, 1])) / 2

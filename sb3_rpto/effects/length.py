@@ -14,8 +14,8 @@ follows from their geoms at one density, as a recompiled model would have it.
 import mujoco
 import numpy as np
 
+from sb3_rpto.effects.batch import SimulationBatch
 from sb3_rpto.effects.inertia import from_tensor, matrices, to_tensor
-from sb3_rpto.effects.world import World
 
 _CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 _BODY = int(mujoco.mjtObj.mjOBJ_BODY)
@@ -47,36 +47,36 @@ def held_by_constraint(model: mujoco.MjModel, body: int) -> str:
     return ""
 
 
-def write_length(world: World, body: int, values: np.ndarray, nominal: float) -> None:
+def write_length(batch: SimulationBatch, body: int, values: np.ndarray, nominal: float) -> None:
     """Stretch a link.
 
-    :param world: its simulations; only those whose value differs from ``nominal`` are written
+    :param batch: its simulations; only those whose value differs from ``nominal`` are written
     :param body: id of the body
     :param values: the longest capsule's length in each simulation, m, (n,)
     :param nominal: that of the model, see :func:`link_length`
     """
     stretched = np.flatnonzero(values != nominal)
     if len(stretched):
-        _Link(world, body, stretched, values[stretched] / nominal).stretch()
+        _Link(batch, body, stretched, values[stretched] / nominal).stretch()
 
 
 class _Link:
     """One body in the simulations where it is stretched by the factors ``scale``."""
 
-    def __init__(self, world: World, body: int, rows: np.ndarray, scale: np.ndarray) -> None:
-        self.world, self.body, self.rows = world, body, rows
-        capsules = _capsules(world.model, body)
-        longest = max(capsules, key=lambda g: world.model.geom_size[g, 1])
+    def __init__(self, batch: SimulationBatch, body: int, rows: np.ndarray, scale: np.ndarray) -> None:
+        self.batch, self.body, self.rows = batch, body, rows
+        capsules = _capsules(batch.model, body)
+        longest = max(capsules, key=lambda g: batch.model.geom_size[g, 1])
         axis = _axes(self.get("geom_quat", longest))
         self.map = np.eye(3) + (scale - 1)[:, None, None] * axis[:, :, None] * axis[:, None, :]
 
     def get(self, name: str, index: int) -> np.ndarray:
         """A copy of an object's field in the stretched simulations."""
-        return self.world.field(name)[self.rows, index]
+        return self.batch.field(name)[self.rows, index]
 
     def put(self, name: str, index: int, values: np.ndarray) -> None:
         """Write an object's field in the stretched simulations."""
-        self.world.field(name)[self.rows, index] = values
+        self.batch.field(name)[self.rows, index] = values
 
     def moved(self, points: np.ndarray) -> np.ndarray:
         """Points (n, 3) of the body's frame, stretched."""
@@ -84,7 +84,7 @@ class _Link:
 
     def stretch(self) -> None:
         """Write all that changes."""
-        model, body = self.world.model, self.body
+        model, body = self.batch.model, self.body
         geoms = _geoms(model, body)
         before = {g: self.moments(g) for g in geoms}
         for g in geoms:
@@ -106,7 +106,7 @@ class _Link:
     def stretch_geom(self, g: int) -> None:
         """Move a geom, and lengthen and turn a capsule."""
         self.put("geom_pos", g, self.moved(self.get("geom_pos", g)))
-        if self.world.model.geom_type[g] != _CAPSULE:
+        if self.batch.model.geom_type[g] != _CAPSULE:
             return
         quat, size = self.get("geom_quat", g), self.get("geom_size", g)
         half = self.moved(_axes(quat) * size[:, 1:2])
@@ -123,7 +123,7 @@ class _Link:
 
     def anchor(self, body: int) -> np.ndarray:
         """Where a body turns, in its own frame (n, 3): the anchor of its first hinge or ball, else its origin."""
-        model = self.world.model
+        model = self.batch.model
         first = int(model.body_jntadr[body])
         for joint in range(first, first + int(model.body_jntnum[body])):
             if model.jnt_type[joint] in _TURNING:
@@ -139,7 +139,7 @@ class _Link:
 
         A geom that only moves keeps its moment about its own centre, which is left out.
         """
-        model = self.world.model
+        model = self.batch.model
         size, centre = self.get("geom_size", g), self.get("geom_pos", g)
         volume = _VOLUMES.get(int(model.geom_type[g]), lambda s: np.zeros(len(s)))(size)
         second = volume[:, None, None] * centre[:, :, None] * centre[:, None, :]

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import mujoco
 import numpy as np
 
-from sb3_rpto.effects.model import numbers, same_layout, set_number
+from sb3_rpto.effects.model_numbers import numbers, same_layout, set_number
 
 #: Statistics that MuJoCo derives, simulates nothing by, and will not read in an MJCF for ever.
 MEANS = ("meaninertia", "meanmass", "meansize")

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects.actuation import BIASES, GAINS, LAGS, servo_of
+from sb3_rpto.effects.batch import SimulationBatch
 from sb3_rpto.effects.effect import Scales
 from sb3_rpto.effects.length import held_by_constraint, link_length, write_length
-from sb3_rpto.effects.world import World
 
 #: Dry friction in N·m or N that is left of a model's own.
 LEAST_FRICTION = 1e-12
@@ -23,27 +23,27 @@ class Number(NamedTuple):
 
     unit: str
     read: Callable[[mujoco.MjModel, int], float]
-    write: Callable[[World, int, np.ndarray, float], None]  # world, id, values (n,), nominal
+    write: Callable[[SimulationBatch, int, np.ndarray, float], None]  # world, id, values (n,), nominal
     size: Callable[[Scales], float]  # scale of a fit where the nominal value is zero
     span: tuple[float, float] | None = None  # default bounds as multiples of the nominal value; None: [0, inf)
     holds: bool = False  # whether a joint stands still where it is large
 
 
 _Read = Callable[[mujoco.MjModel, int], float]
-_Write = Callable[[World, int, np.ndarray, float], None]
+_Write = Callable[[SimulationBatch, int, np.ndarray, float], None]
 
 
 def _dof(name: str) -> tuple[_Read, _Write]:
     def read(model: mujoco.MjModel, joint: int) -> float:
         return float(getattr(model, name)[model.jnt_dofadr[joint]])
 
-    def write(world: World, joint: int, values: np.ndarray, nominal: float) -> None:
-        dof = int(world.model.jnt_dofadr[joint])
+    def write(batch: SimulationBatch, joint: int, values: np.ndarray, nominal: float) -> None:
+        dof = int(batch.model.jnt_dofadr[joint])
         if name == "dof_frictionloss":
-            world.rough(dof)
+            batch.rough(dof)
             # At 0 nothing would tell a saved model that the joint has a constraint of its own.
             values = np.maximum(values, LEAST_FRICTION) if nominal > 0 else values
-        world.field(name)[:, dof] = values
+        batch.field(name)[:, dof] = values
 
     return read, write
 
@@ -53,22 +53,22 @@ def _column(name: str, column: int | None = None) -> tuple[_Read, _Write]:
         values = getattr(model, name)[index]
         return float(values if column is None else values[column])
 
-    def write(world: World, index: int, values: np.ndarray, nominal: float) -> None:
+    def write(batch: SimulationBatch, index: int, values: np.ndarray, nominal: float) -> None:
         if column is None:
-            world.field(name)[:, index] = values
+            batch.field(name)[:, index] = values
         else:
-            world.field(name)[:, index, column] = values
+            batch.field(name)[:, index, column] = values
 
     return read, write
 
 
-def _write_mass(world: World, body: int, values: np.ndarray, nominal: float) -> None:
-    world.field("body_mass")[:, body] *= values / nominal
-    world.field("body_inertia")[:, body] *= (values / nominal)[:, None]
+def _write_mass(batch: SimulationBatch, body: int, values: np.ndarray, nominal: float) -> None:
+    batch.field("body_mass")[:, body] *= values / nominal
+    batch.field("body_inertia")[:, body] *= (values / nominal)[:, None]
 
 
-def _write_inertia(world: World, body: int, values: np.ndarray, nominal: float) -> None:
-    inertia = world.field("body_inertia")[:, body]
+def _write_inertia(batch: SimulationBatch, body: int, values: np.ndarray, nominal: float) -> None:
+    inertia = batch.field("body_inertia")[:, body]
     inertia *= (values / inertia[:, 0])[:, None]
 
 
@@ -79,9 +79,9 @@ def _read_kp(model: mujoco.MjModel, actuator: int) -> float:
     return float(model.actuator_gainprm[actuator, 0])
 
 
-def _write_kp(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
-    world.field("actuator_gainprm")[:, actuator, 0] = values
-    world.field("actuator_biasprm")[:, actuator, 1] = -values
+def _write_kp(batch: SimulationBatch, actuator: int, values: np.ndarray, nominal: float) -> None:
+    batch.field("actuator_gainprm")[:, actuator, 0] = values
+    batch.field("actuator_biasprm")[:, actuator, 1] = -values
 
 
 def _read_kv(model: mujoco.MjModel, actuator: int) -> float:
@@ -90,11 +90,11 @@ def _read_kv(model: mujoco.MjModel, actuator: int) -> float:
     return -float(model.actuator_biasprm[actuator, 2])
 
 
-def _write_kv(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
+def _write_kv(batch: SimulationBatch, actuator: int, values: np.ndarray, nominal: float) -> None:
     # Of the two servos that have it, that of the velocity: :func:`servo_of` cannot tell once the gain has changed.
-    if world.model.actuator_gainprm[actuator, 0] and not world.model.actuator_biasprm[actuator, 1]:
-        world.field("actuator_gainprm")[:, actuator, 0] = values
-    world.field("actuator_biasprm")[:, actuator, 2] = -values
+    if batch.model.actuator_gainprm[actuator, 0] and not batch.model.actuator_biasprm[actuator, 1]:
+        batch.field("actuator_gainprm")[:, actuator, 0] = values
+    batch.field("actuator_biasprm")[:, actuator, 2] = -values
 
 
 def _read_timeconst(model: mujoco.MjModel, actuator: int) -> float:
@@ -127,9 +127,9 @@ def _read_strength(model: mujoco.MjModel, actuator: int) -> float:
     return 1.0
 
 
-def _write_strength(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
+def _write_strength(batch: SimulationBatch, actuator: int, values: np.ndarray, nominal: float) -> None:
     for name in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"):
-        world.field(name)[:, actuator] *= values[:, None]
+        batch.field(name)[:, actuator] *= values[:, None]
 
 
 def _read_length(model: mujoco.MjModel, body: int) -> float:
@@ -145,8 +145,8 @@ def _read_gear(model: mujoco.MjModel, actuator: int) -> float:
     return float(gear[np.argmax(np.abs(gear))])
 
 
-def _write_gear(world: World, actuator: int, values: np.ndarray, nominal: float) -> None:
-    world.field("actuator_gear")[:, actuator] = np.outer(values / nominal, world.model.actuator_gear[actuator])
+def _write_gear(batch: SimulationBatch, actuator: int, values: np.ndarray, nominal: float) -> None:
+    batch.field("actuator_gear")[:, actuator] = np.outer(values / nominal, batch.model.actuator_gear[actuator])
 
 
 def _range(model: mujoco.MjModel, joint: int) -> float:
@@ -154,10 +154,10 @@ def _range(model: mujoco.MjModel, joint: int) -> float:
     return float(high - low) if model.jnt_limited[joint] else 0.0
 
 
-def _write_range(world: World, joint: int, values: np.ndarray, nominal: float) -> None:
-    limits = world.field("jnt_range")[:, joint]
+def _write_range(batch: SimulationBatch, joint: int, values: np.ndarray, nominal: float) -> None:
+    limits = batch.field("jnt_range")[:, joint]
     # The range keeps the reference pose, or the bound next to it.
-    reference = world.model.qpos0[world.model.jnt_qposadr[joint]]
+    reference = batch.model.qpos0[batch.model.jnt_qposadr[joint]]
     pivot = np.clip(reference, limits[:, :1], limits[:, 1:])
     limits[:] = pivot + (limits - pivot) * (values / nominal)[:, None]
 
@@ -202,16 +202,16 @@ NUMBERS: dict[str, dict[str, Number]] = {
 }
 
 
-def _write_gravity(world: World, index: int, values: np.ndarray, nominal: float) -> None:
-    world.field("opt.gravity")[:] *= (values / nominal)[:, None]
+def _write_gravity(batch: SimulationBatch, index: int, values: np.ndarray, nominal: float) -> None:
+    batch.field("opt.gravity")[:] *= (values / nominal)[:, None]
 
 
 def _option(name: str) -> tuple[_Read, _Write]:
     def read(model: mujoco.MjModel, index: int) -> float:
         return float(getattr(model.opt, name))
 
-    def write(world: World, index: int, values: np.ndarray, nominal: float) -> None:
-        world.field(f"opt.{name}")[:] = values.reshape(world.field(f"opt.{name}").shape)
+    def write(batch: SimulationBatch, index: int, values: np.ndarray, nominal: float) -> None:
+        batch.field(f"opt.{name}")[:] = values.reshape(batch.field(f"opt.{name}").shape)
 
     return read, write
 

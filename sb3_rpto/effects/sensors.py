@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects.actuation import JOINTS, joints_of_tendon
+from sb3_rpto.effects.batch import SimulationBatch
 from sb3_rpto.effects.effect import Effect, Parameter, register
-from sb3_rpto.effects.world import World
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -91,10 +91,10 @@ class SensorBias(Effect):
         """Shift it back."""
         return q - _along(x[..., 0], q), v
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Feed back what is shown."""
-        for i, share in readers(self, world.model).items():
-            bias, gear = world.field("actuator_biasprm"), world.field("actuator_gear")
+        for i, share in readers(self, batch.model).items():
+            bias, gear = batch.field("actuator_biasprm"), batch.field("actuator_gear")
             bias[:, i, 0] += bias[:, i, 1] * gear[:, i, 0] * share * x[:, 0]
 
 
@@ -123,8 +123,8 @@ class SensorGain(Effect):
         gain = 1 + _along(x[..., 0], q)
         return q / gain, v / gain
 
-    def write(self, world: World, x: np.ndarray) -> None:
+    def write(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Feed back what is shown."""
-        alone = [i for i in readers(self, world.model) if len(_lengths(world.model, i)) == 1]
+        alone = [i for i in readers(self, batch.model) if len(_lengths(batch.model, i)) == 1]
         for i in alone:
-            world.field("actuator_biasprm")[:, i, 1] *= 1 + x[:, 0]
+            batch.field("actuator_biasprm")[:, i, 1] *= 1 + x[:, 0]

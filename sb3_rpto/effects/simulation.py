@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects.actuation import FILTERS, command_limits
+from sb3_rpto.effects.batch import MujocoBatch, SimulationBatch
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
 from sb3_rpto.effects.engine import lean, quiet, untimed
 from sb3_rpto.effects.names import object_names
-from sb3_rpto.effects.world import BatchWorld, World
 
 #: After so many time constants a filter has forgotten.
 CONSTANTS = 5
@@ -76,11 +76,11 @@ class Simulation:
         #: (p,) False for parameters of shape, which do nothing by themselves
         self.strength = np.array([not p.shape for e in self.effects for p in e.parameters], dtype=bool)
         self._settings: dict[str, Declared] = {}
-        self._worlds: dict[tuple[int, ...], BatchWorld] = {}
-        self._kinds: dict[tuple[int, ...], BatchWorld] = {}
+        self._batches: dict[tuple[int, ...], MujocoBatch] = {}
+        self._kinds: dict[tuple[int, ...], MujocoBatch] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_worlds": {}, "_kinds": {}}  # batches are made anew
+        return {**vars(self), "_batches": {}, "_kinds": {}}  # batches are made anew
 
     def values(self) -> np.ndarray:
         """The effects' own values, (p,)."""
@@ -102,9 +102,9 @@ class Simulation:
         steps = total - drive.before
         known, active = self.from_settings(drive.settings), self.active(values)
         commands = filter_commands(active, drive.commands, self.model.opt.timestep)
-        world = self._world(self._worlds, n, [*known, *active])
-        world.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        self._prepare(world, [*known, *active])
+        batch = self._batch(self._batches, n, [*known, *active])
+        batch.engine.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self._prepare(batch, [*known, *active])
         out_q = np.empty((n, steps + 1, self.model.nq))
         out_v = np.empty((n, steps + 1, self.model.nv))
         out_q[:, 0], out_v[:, 0] = qpos, qvel
@@ -113,9 +113,9 @@ class Simulation:
                 # Declared filters may remember for longer than the model's own.
                 slow = [float(x.max()) for e, x in active if isinstance(e, Declared) and e.number[2] == "timeconst"]
                 seconds = max([memory(self.model), *(CONSTANTS * x for x in slow)])
-                self._lead(world, commands[:, : drive.before], qpos, qvel, seconds)
-            world.qpos[:], world.qvel[:] = qpos, qvel
-            self._run(world, active, drive._replace(commands=commands[:, drive.before :]), out_q, out_v)
+                self._lead(batch, commands[:, : drive.before], qpos, qvel, seconds)
+            batch.qpos[:], batch.qvel[:] = qpos, qvel
+            self._run(batch, active, drive._replace(commands=commands[:, drive.before :]), out_q, out_v)
         bad = ~(np.isfinite(out_q).all(-1) & (np.abs(out_v) < 1e6).all(-1))
         if bad.any():
             bad = np.maximum.accumulate(bad, axis=1)
@@ -165,7 +165,7 @@ class Simulation:
 
     def _run(
         self,
-        world: BatchWorld,
+        batch: MujocoBatch,
         active: Active,
         drive: Drive,
         out_q: np.ndarray,
@@ -176,49 +176,49 @@ class Simulation:
         steps = commands.shape[1]
         acting = pushing(active)
         if acting or enabled is not None:
-            switch, push = Switch(world, enabled), Push(world, acting)
+            switch, push = Switch(batch, enabled), Push(batch, acting)
             for k in range(steps):
-                world.ctrl[:] = commands[:, k]
+                batch.ctrl[:] = commands[:, k]
                 switch(k)
                 push(begins=k % drive.hold == 0)
-                world.batch.step()
-                out_q[:, k + 1], out_v[:, k + 1] = world.qpos, world.qvel
+                batch.engine.step()
+                out_q[:, k + 1], out_v[:, k + 1] = batch.qpos, batch.qvel
         else:
-            world.force[:], world.pull[:], world.friction[:] = 0, 0, 0
-            world.commit()
-            record = world.batch.rollout(steps, commands, record=("qpos", "qvel"))
+            batch.force[:], batch.pull[:], batch.friction[:] = 0, 0, 0
+            batch.commit()
+            record = batch.engine.rollout(steps, commands, record=("qpos", "qvel"))
             out_q[:, 1:], out_v[:, 1:] = record["qpos"], record["qvel"]
             # A rollout holds a simulation at its first warning; here that is the end of it.
-            for i in np.flatnonzero(world.batch.warning[:, :, 1].any(axis=1)):
+            for i in np.flatnonzero(batch.engine.warning[:, :, 1].any(axis=1)):
                 out_q[i, (out_q[i] == out_q[i, -1]).all(axis=-1)] = np.nan
 
-    def _lead(self, world: BatchWorld, past: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, seconds: float) -> None:
+    def _lead(self, batch: MujocoBatch, past: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, seconds: float) -> None:
         """Lead the actuators' own filters and delays through the last commands before the start, the motion held."""
         past = past[:, max(0, past.shape[1] - math.ceil(seconds / self.model.opt.timestep)) :]
         if not past.shape[1]:
             return
-        world.batch.bind("act")[:] = settled(self.model, past[:, 0])
+        batch.engine.bind("act")[:] = settled(self.model, past[:, 0])
         for k in range(past.shape[1]):
-            world.qpos[:], world.qvel[:], world.ctrl[:] = qpos, qvel, past[:, k]
-            world.batch.step()
+            batch.qpos[:], batch.qvel[:], batch.ctrl[:] = qpos, qvel, past[:, k]
+            batch.engine.step()
 
-    def _prepare(self, world: BatchWorld, active: Active) -> None:
+    def _prepare(self, batch: MujocoBatch, active: Active) -> None:
         """As :func:`prepare`, but once for all simulations that are alike, as most are in a fit."""
-        first, kind = alike(active, world.n)
-        if 2 * len(first) > world.n:
-            prepare(world, active)
+        first, kind = alike(active, batch.n)
+        if 2 * len(first) > batch.n:
+            prepare(batch, active)
         else:
-            few = self._world(self._kinds, len(first), active)
+            few = self._batch(self._kinds, len(first), active)
             prepare(few, [(effect, x[first]) for effect, x in active])
-            world.settle_as(few, kind)
+            batch.settle_as(few, kind)
 
-    def _world(self, kept: dict[tuple[int, ...], BatchWorld], n: int, active: Active) -> BatchWorld:
+    def _batch(self, kept: dict[tuple[int, ...], MujocoBatch], n: int, active: Active) -> MujocoBatch:
         """One of the last few batches, as the model is: a field once written is copied in every step from then on."""
         key = (n, *(id(effect) for effect, _ in active))
         if key not in kept:
             if len(kept) >= KEPT:
                 kept.pop(next(iter(kept)))
-            kept[key] = BatchWorld(self.model, n, self.nthread)
+            kept[key] = MujocoBatch(self.model, n, self.nthread)
         kept[key].restore()
         return kept[key]
 
@@ -241,7 +241,7 @@ def alike(active: Active, n: int) -> tuple[np.ndarray, np.ndarray]:
     return begins[first], np.repeat(kind.ravel(), np.diff(begins, append=n))
 
 
-def prepare(world: World, active: Active) -> None:
+def prepare(batch: SimulationBatch, active: Active) -> None:
     """Write what the effects change of the model: numbers, known or declared, first, additions after.
 
     What a sensor does last is written first: a servo's gain on the joint's position is then one on what comes before.
@@ -249,8 +249,8 @@ def prepare(world: World, active: Active) -> None:
     ordered = sorted(active, key=lambda pair: pair[0].rank if isinstance(pair[0], Declared) else math.inf)
     sensing = [pair for pair in ordered if pair[0].senses]
     for effect, x in [*(pair for pair in ordered if not pair[0].senses), *reversed(sensing)]:
-        effect.write(world, x)
-    world.settle()
+        effect.write(batch, x)
+    batch.settle()
 
 
 def pushing(active: Active) -> Active:
@@ -264,11 +264,11 @@ class Push:
     :param acting: from :func:`pushing`
     """
 
-    def __init__(self, world: World, acting: Active) -> None:
-        self.world = world
+    def __init__(self, batch: SimulationBatch, acting: Active) -> None:
+        self.batch = batch
         self.held = [pair for pair in acting if pair[0].held]
         self.acting = [pair for pair in acting if not pair[0].held]
-        self.kept = np.zeros_like(world.force)
+        self.kept = np.zeros_like(batch.force)
 
     def __call__(self, begins: bool) -> None:
         """Those of the next substep.
@@ -276,20 +276,20 @@ class Push:
         :param begins: whether a step of the environment begins with it
         """
         if begins and self.held:
-            collect(self.world, self.held)
-            self.kept[:] = self.world.force
-        collect(self.world, self.acting)
-        self.world.force += self.kept
-        self.world.commit()
+            collect(self.batch, self.held)
+            self.kept[:] = self.batch.force
+        collect(self.batch, self.acting)
+        self.batch.force += self.kept
+        self.batch.commit()
 
 
-def collect(world: World, acting: Active) -> None:
+def collect(batch: SimulationBatch, acting: Active) -> None:
     """Collect the forces of one substep."""
-    world.forget()
+    batch.forget()
     if any(effect.asks_simulator for effect, _ in acting):
-        world.evaluate()
+        batch.evaluate()
     for effect, x in acting:
-        effect.act(world, x)
+        effect.act(batch, x)
 
 
 def filter_commands(active: Active, commands: np.ndarray, dt: float) -> np.ndarray:
@@ -311,10 +311,10 @@ class Switch:
 
     FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_damping", "actuator_dampingpoly")
 
-    def __init__(self, world: World, enabled: np.ndarray | None) -> None:
-        self.world, self.enabled = world, enabled
+    def __init__(self, batch: SimulationBatch, enabled: np.ndarray | None) -> None:
+        self.batch, self.enabled = batch, enabled
         if enabled is not None:
-            self.on = {name: world.field(name).copy() for name in self.FIELDS}
+            self.on = {name: batch.field(name).copy() for name in self.FIELDS}
             self.last = np.ones_like(enabled[:, 0])
 
     def __call__(self, k: int) -> None:
@@ -324,8 +324,8 @@ class Switch:
         self.last = self.enabled[:, k]
         for name, on in self.on.items():
             mask = self.last.reshape(*self.last.shape, *[1] * (on.ndim - 2))
-            self.world.field(name)[:] = on * mask
-        self.world.derive()  # the damping of actuators reaches the joints through derived constants
+            self.batch.field(name)[:] = on * mask
+        self.batch.derive()  # the damping of actuators reaches the joints through derived constants
 
 
 def memory(model: mujoco.MjModel) -> float:

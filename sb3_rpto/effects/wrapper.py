@@ -13,11 +13,12 @@ import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.utils import EzPickle, RecordConstructorArgs
 
+from sb3_rpto.effects.batch import LiveSimulation
 from sb3_rpto.effects.declared import Declared
 from sb3_rpto.effects.effect import Effect
+from sb3_rpto.effects.model_numbers import numbers, set_number
 from sb3_rpto.effects.sensors import SensorGain, ago, readers
 from sb3_rpto.effects.simulation import Active, Push, prepare, pushing
-from sb3_rpto.effects.world import LiveWorld
 
 # Where gymnasium's MujocoEnv steps its physics, and what an environment without that method may offer instead.
 _SEAMS = ("_step_mujoco_simulation", "do_simulation")
@@ -80,7 +81,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, effects=effects)
         gym.Wrapper.__init__(self, env)
         base, self._seam = stepped_by(env)
-        self._world = LiveWorld(base.model, base.data)
+        self._batch = LiveSimulation(base.model, base.data)
         self.effects: list[Effect] = []
         self._commanding: list[tuple[Effect, np.ndarray]] = []
         self._memory: list[dict[str, Any]] = []
@@ -112,8 +113,8 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         if self._covered:
             raise ValueError("other effects came on top of these; set those, or begin from an environment without")
         base: Any = self.unwrapped
-        self._world.restore()
-        self._world.settle()
+        self._batch.restore()
+        self._batch.settle()
         try:
             # Only now: what declared parameters start from is the model's own again.
             mine = own(effects, base.model)
@@ -130,10 +131,10 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
                     "would act; override do_simulation() instead, and call super() in it"
                 )
         except Exception:
-            prepare(self._world, active(self.effects))
+            prepare(self._batch, active(self.effects))
             raise
         self.effects, found = mine, active(mine)
-        prepare(self._world, found)
+        prepare(self._batch, found)
         memories = {effect.label: memory for (effect, _), memory in zip(self._commanding, self._memory)}
         self._acting = [pair for pair in found if pair[0].overrides("act")]
         self._commanding = sorted((p for p in found if p[0].overrides("command")), key=lambda pair: pair[0].order)
@@ -152,7 +153,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
 
     def _require_whole_servos(self, effects: Sequence[Effect]) -> None:
         """What a servo feeds back of its sensor is written once, with all that the sensor does."""
-        model = self._world.model
+        model = self._batch.model
         beneath = [effect for layer in corrections(self)[1:] for effect, _ in layer._sensing]
         for effect, _ in active(effects):
             fed_back = effect.senses and effect.overrides("write") and readers(effect, model)
@@ -174,9 +175,9 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         :raises ValueError: the environment's own reset writes numbers of the model that these effects have set
         """
         self._begin_anew()
-        before = self._world.written()
+        before = self._batch.written()
         begun = self.env.reset(seed=seed, options=options)
-        lost = [name for name, values in self._world.written().items() if not np.array_equal(values, before[name])]
+        lost = [name for name, values in self._batch.written().items() if not np.array_equal(values, before[name])]
         if lost:
             raise ValueError(
                 f"reset() of {type(self.unwrapped).__name__} writes {', '.join(lost)} of its model, which the effects "
@@ -186,7 +187,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         return begun
 
     def _begin_anew(self) -> None:
-        step = float(self._world.model.opt.timestep)
+        step = float(self._batch.model.opt.timestep)
         self._memory = [effect.memory_at_reset(x, step) for effect, x in self._commanding]
         self._past = []
 
@@ -209,7 +210,7 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         """
         if getattr(self.unwrapped, "mujoco_renderer", self) is None:
             raise RuntimeError(
-                "a corrected copy draws no pictures; for those sb3_rpto.effects.stance.StandingEnv(gym.make(..., "
+                "a corrected copy draws no pictures; for those sb3_rpto.effects.walker_reset.StandingEnv(gym.make(..., "
                 "render_mode='rgb_array'), effects)"
             )
         return self.env.render()
@@ -241,18 +242,18 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         commanding = [
             (*pair, earlier) for layer in stack for pair, earlier in zip(layer._commanding, layer._memory, strict=True)
         ]
-        world = LiveWorld(model, data)  # whose restore takes back the substeps' own changes alone
+        batch = LiveSimulation(model, data)  # whose restore takes back the substeps' own changes alone
         for effect, _ in acting:
             if effect.place == "joint":
-                world.rough(effect.dof)
-        world.settle()
+                batch.rough(effect.dof)
+        batch.settle()
         command, dt = np.array(ctrl, dtype=float), model.opt.timestep
         forces, pulls = data.qfrc_applied.copy(), data.xfrc_applied.copy()  # the environment's own
         ages = _ages([pair for layer in stack for pair in layer._sensing])
         kept = math.ceil(max(ages.values(), default=0.0) / dt) + 1
         if kept > 1 and not self._past:
             self._past = [(data.qpos.copy(), data.qvel.copy())]
-        push = Push(world, acting)
+        push = Push(batch, acting)
         for k in range(n_frames):
             sent = command.copy()
             for effect, x, earlier in commanding:
@@ -261,14 +262,14 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
             if acting:
                 push(begins=k == 0)
                 data.qfrc_applied += forces
-                if world.pulls:
+                if batch.pulls:
                     data.xfrc_applied[:, :3] += pulls[:, :3]
             mujoco.mj_step(model, data)
             if kept > 1:
                 self._past = [*self._past[1 - kept :], (data.qpos.copy(), data.qvel.copy())]
         if acting:
             # What a later set_state computes must not depend on the substep before it.
-            world.restore()
+            batch.restore()
             data.qfrc_applied[:], data.xfrc_applied[:] = forces, pulls
         mujoco.mj_rnePostConstraint(model, data)
         self._time = float(data.time)
@@ -302,16 +303,16 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
         if not isinstance(self.unwrapped, EzPickle):
             raise TypeError(
                 f"{type(self.unwrapped).__name__} is no EzPickle, so its pickle would hide what was written to its "
-                "model; derive it from gymnasium.utils.EzPickle (envs.copies.copy_env copies it in one process)"
+                "model; derive it from gymnasium.utils.EzPickle (envs.env_copy.copy_env copies it in one process)"
             )
         if self._covered:  # the outermost keeps the numbers for all
             return {"env": self.env, "effects": self.effects}
-        self._world.restore()
-        self._world.settle()
+        self._batch.restore()
+        self._batch.settle()
         try:
             model = copy.copy(self.unwrapped.model)  # type: ignore[attr-defined]
         finally:
-            prepare(self._world, active(self.effects))
+            prepare(self._batch, active(self.effects))
         return {"env": self.env, "effects": self.effects, "model": model}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -321,8 +322,6 @@ class CorrectedEnv(gym.Wrapper, RecordConstructorArgs):
 
 def with_numbers(env: gym.Env, model: mujoco.MjModel | None) -> gym.Env:
     """An environment that was made anew, with what had been written to its model since it was first made."""
-    from sb3_rpto.effects.model import numbers, set_number  # which imports this module
-
     if model is None:
         return env
     base: Any = env.unwrapped

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from sb3_rpto.effects.batch import SimulationBatch
 from sb3_rpto.effects.effect import Effect, register
 from sb3_rpto.effects.friction import CoulombFriction, QuadraticDrag, ViscousFriction
-from sb3_rpto.effects.world import World
 
 
 class _Held(Effect):
@@ -32,9 +32,9 @@ class HeldFriction(_Held):
     equation = "-level sign(qd), held"
     excite = "motion that often reverses, at small and at large speed"
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add the force."""
-        world.force[:, self.dof] -= x[:, 0] * np.sign(world.qvel[:, self.dof])
+        batch.force[:, self.dof] -= x[:, 0] * np.sign(batch.qvel[:, self.dof])
 
 
 @register
@@ -46,9 +46,9 @@ class HeldDamping(_Held):
     equation = "-coefficient qd, held"
     excite = "motion at several speeds"
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add the force."""
-        world.force[:, self.dof] -= x[:, 0] * world.qvel[:, self.dof]
+        batch.force[:, self.dof] -= x[:, 0] * batch.qvel[:, self.dof]
 
 
 @register
@@ -60,7 +60,7 @@ class HeldDrag(_Held):
     equation = "-coefficient |qd| qd, held"
     excite = "fast motion"
 
-    def act(self, world: World, x: np.ndarray) -> None:
+    def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
         """Add the force."""
-        v = world.qvel[:, self.dof]
-        world.force[:, self.dof] -= x[:, 0] * np.abs(v) * v
+        v = batch.qvel[:, self.dof]
+        batch.force[:, self.dof] -= x[:, 0] * np.abs(v) * v

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import gymnasium as gym
 
 from sb3_rpto.effects.effect import LIBRARY, Effect
-from sb3_rpto.effects.stance import StandingEnv
+from sb3_rpto.effects.walker_reset import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
-from sb3_rpto.envs.env_copy import copy_env
+from sb3_rpto.envs.env_copy import CopyError, copy_env, must_copy
 
 
 def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:
@@ -17,7 +17,7 @@ def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:
     ``make_vec_env`` does, or their episodes begin alike.
 
     :param env: a gymnasium MuJoCo environment, with all its wrappers; the copy draws no pictures and writes no files
-        (for those ``StandingEnv(gym.make(..., render_mode=...), effects)`` of :mod:`sb3_rpto.effects.stance`)
+        (for those ``StandingEnv(gym.make(..., render_mode=...), effects)`` of :mod:`sb3_rpto.effects.walker_reset`)
     :param effects: with their values; they come on top of those that ``env`` has already
     :raises TypeError: a VecEnv
     :raises ValueError: no gymnasium MuJoCo environment, or one that cannot be copied
@@ -27,12 +27,12 @@ def apply_effects(env: gym.Env, effects: Sequence[Effect]) -> CorrectedEnv:
             f"env must be a gymnasium environment, not {type(env).__name__}; correct those of a VecEnv before "
             "make_vec_env stacks them; of an MJCF file save the report, its model.xml is the corrected one"
         )
-    twin = copy_env(env)
-    if twin is None:
+    try:
+        twin = must_copy(env)
+    except CopyError as error:
         raise ValueError(
-            f"{env} holds what cannot be copied; make a new one and wrap it: "
-            "sb3_rpto.effects.stance.StandingEnv(gym.make(...), effects)"
-        )
+            f"{env} cannot be copied ({error}); or wrap a new one: StandingEnv(gym.make(...), effects)"
+        ) from error
     return StandingEnv(twin, effects)
 
 

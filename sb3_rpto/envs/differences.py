@@ -8,8 +8,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sb3_rpto.effects.model_numbers import differing, numbers
+from sb3_rpto.effects.names import object_names
+from sb3_rpto.effects.wrapper import beyond_model
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
-from sb3_rpto.envs.env_copy import copy_env
+from sb3_rpto.envs.env_copy import EnvSource, make_env, must_copy
 
 #: What tasks keep beside the model that decides on resets and ends.
 _TASK = ("init_qpos", "init_qvel", "_healthy_z_range", "_healthy_angle_range", "_healthy_state_range")
@@ -51,20 +54,20 @@ class Difference:
         return "\n".join([*lines, f"{moves} from the same state under the same actions"])
 
 
-def differs(source: gym.Env | str, target: gym.Env | str, *, seed: int = 0, steps: int = 2_000) -> Difference:
+def differs(source: EnvSource, target: EnvSource, *, seed: int = 0, steps: int = 2_000) -> Difference:
     """Compare compiled models, and trajectories from the same states under the same actions.
 
     Random actions, each held for :data:`HELD` steps, go to copies of both until the first answer (observation, reward
     or termination) that differs by a bit; after an episode that ended in both, another begins. Where a MuJoCo task
     starts otherwise, which is told apart, the target is put where the source starts.
 
-    :param source: an environment or its id
+    :param source: an environment, its id, or a function that makes it
     :param target: likewise
     :param seed: of the resets and the actions
     :param steps: compared at most
     :raises ValueError: spaces that differ, or an environment that cannot be copied
     """
-    one, other = _copy(source), _copy(target)
+    one, other = must_copy(make_env(source, "source")), must_copy(make_env(target, "target"))
     space = one.action_space
     if space != other.action_space or one.observation_space != other.observation_space:
         raise ValueError("source and target have different spaces, so there are no same actions")
@@ -73,13 +76,6 @@ def differs(source: gym.Env | str, target: gym.Env | str, *, seed: int = 0, step
     task = tuple(name for name in _TASK if not _equal(mine.get(name), theirs.get(name)))
     effects = tuple(sorted(_effects(one) ^ _effects(other)))
     return Difference(_numbers(one.unwrapped, other.unwrapped), task, effects, start, step, steps)
-
-
-def _copy(env: gym.Env | str) -> gym.Env:
-    copy = copy_env(gym.make(env) if isinstance(env, str) else env)
-    if copy is None:
-        raise ValueError(f"{env} holds what cannot be copied; compare environments as gym.make gives them")
-    return copy
 
 
 def _first_difference(one: gym.Env, other: gym.Env, seed: int, steps: int) -> tuple[bool, int | None]:
@@ -119,8 +115,6 @@ def _task(env: gym.Env) -> dict[str, Any]:
 def _effects(env: gym.Env) -> set[str]:
     if not hasattr(env.unwrapped, "model"):
         return set()
-    from sb3_rpto.effects.wrapper import beyond_model
-
     return set(beyond_model(env))
 
 
@@ -131,8 +125,6 @@ def _numbers(one: Any, other: Any) -> dict[str, tuple[str, ...]]:
         return {name: () for name in mine if mine[name] != theirs[name]}
     if not hasattr(one, "model"):
         return {}
-    from sb3_rpto.effects.model import differing, numbers
-
     mine, theirs = numbers(one.model), numbers(other.model)
     return {
         name: _objects(one.model, name, mine[name] != theirs[name])
@@ -144,8 +136,6 @@ def _numbers(one: Any, other: Any) -> dict[str, tuple[str, ...]]:
 
 def _objects(model: Any, name: str, unequal: np.ndarray) -> tuple[str, ...]:
     """Names of the objects whose rows of a field are unequal; none for a field of the whole model."""
-    from sb3_rpto.effects.names import object_names
-
     kind = {"body": "body", "geom": "geom", "jnt": "joint", "dof": "joint", "actuator": "actuator"}.get(
         name.partition("_")[0]
     )

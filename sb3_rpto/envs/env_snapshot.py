@@ -11,6 +11,7 @@ import pickle
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from gymnasium import wrappers
 from gymnasium.envs.classic_control import Continuous_MountainCarEnv, PendulumEnv
@@ -20,6 +21,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
+from sb3_rpto.envs.env_copy import FACTORY
 from sb3_rpto.envs.observations import layers
 
 # What changes in each layer after it is made. Clocks are left out: they do not influence the course of a run.
@@ -181,7 +183,7 @@ def _wrapper_state(layer: gym.Env) -> tuple[str, ...] | None:
     if hasattr(type(layer), "state_attributes"):
         return type(layer).state_attributes  # type: ignore[attr-defined]
     # A wrapper that holds nothing of its own has nothing to save.
-    own = vars(layer).keys() - vars(gym.Wrapper(gym.Env())).keys() - {"_saved_kwargs"}
+    own = vars(layer).keys() - vars(gym.Wrapper(gym.Env())).keys() - {"_saved_kwargs", FACTORY}
     return None if own else ()
 
 
@@ -237,8 +239,6 @@ def _restore_simulation(base: gym.Env, saved: dict[str, Any]) -> None:
     if saved["kind"] == "own":
         _call(base, 1, copy.deepcopy(saved["simulation"]))
     elif saved["kind"] != "plain":
-        import mujoco
-
         mujoco.mj_copyData(base.data, base.model, pickle.loads(saved["simulation"]))  # type: ignore[attr-defined]
 
 

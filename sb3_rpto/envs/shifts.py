@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
+from sb3_rpto.effects.declared import Declared, declare
+from sb3_rpto.effects.effect import Effect, from_json
+from sb3_rpto.effects.walker_reset import StandingEnv, WalkerReset
+from sb3_rpto.effects.wrapper import CorrectedEnv, with_numbers
 from sb3_rpto.envs.cartpole import ContinuousCartPoleEnv
 from sb3_rpto.envs.differences import Difference, differs
-from sb3_rpto.envs.env_copy import copy_env
-
-if TYPE_CHECKING:  # MuJoCo is needed for MuJoCo's tasks alone
-    from sb3_rpto.effects import Effect
+from sb3_rpto.envs.env_copy import CopyError, must_copy
 
 __all__ = ["Difference", "EnvShift", "ShiftedCartPole", "differs"]
 
@@ -33,7 +35,7 @@ class EnvShift:
     :class:`~sb3_rpto.envs.cartpole.CartPoleParameters`.
 
     A walker that a shift has made taller or smaller stands at reset as it did before; see
-    :class:`~sb3_rpto.effects.stance.Stance`.
+    :class:`~sb3_rpto.effects.walker_reset.WalkerReset`.
 
     :param name: what it is called
     :param factors: of numbers by name, each > 0; where two names mean one number, both count
@@ -85,10 +87,10 @@ class EnvShift:
         """
         if not isinstance(env, gym.Env):
             raise TypeError(f"env must be a gymnasium environment, not {type(env).__name__}; shift each one before")
-        twin = copy_env(env)
-        if twin is None:
-            raise ValueError(f"{env} holds what cannot be copied; make a new one and use shift.wrap(gym.make(...))")
-        return self.wrap(twin)
+        try:
+            return self.wrap(must_copy(env))
+        except CopyError as error:
+            raise ValueError(f"{env} cannot be copied ({error}); or use shift.wrap(gym.make(...))") from error
 
     def wrap(self, env: gym.Env) -> gym.Env:
         """``env`` itself, shifted: its innermost environment has the target's numbers from now on.
@@ -97,8 +99,6 @@ class EnvShift:
         """
         if isinstance(env.unwrapped, ContinuousCartPoleEnv):
             return ShiftedCartPole(env, self)
-        from sb3_rpto.envs.shifted import ShiftedEnv
-
         return ShiftedEnv(env, self)
 
     def __str__(self) -> str:
@@ -131,8 +131,6 @@ def number_names(env: gym.Env, names: Sequence[str]) -> list[str]:
     """
     base: Any = env.unwrapped
     if not isinstance(base, ContinuousCartPoleEnv):
-        from sb3_rpto.effects import declare
-
         return [number.label for number in declare(base.model, names) if number.nominal or number.label in names]
     known = vars(base.parameters)
     unknown = sorted(set(names) - known.keys())
@@ -161,3 +159,47 @@ class ShiftedCartPole(gym.Wrapper, RecordConstructorArgs):
         base: Any = self.unwrapped
         number_names(env, list(shift.factors))
         base.scale(shift.factors)
+
+
+def shift_effects(shift: EnvShift, env: gym.Env) -> list[Effect]:
+    """What a shift does to a MuJoCo environment: declared numbers with other values, and effects.
+
+    :raises ValueError: names that the model does not have, numbers that are 0
+    """
+    model = env.unwrapped.model  # type: ignore[attr-defined]
+    scaled: dict[tuple[str, int, str], Declared] = {}  # one number may be called by several names
+    for name, factor in shift.factors.items():
+        for label in number_names(env, [name]):
+            number = Declared(model, label, (-np.inf, np.inf))
+            number = scaled.get(number.number, number)
+            if number.nominal == 0:
+                raise ValueError(f"{shift.name}: {label} is 0 in the model, so it cannot be scaled; give an effect")
+            scaled[number.number] = number.with_values(number.values * factor)
+    return [*scaled.values(), *map(from_json, shift.effects)]  # type: ignore[arg-type]
+
+
+class ShiftedEnv(StandingEnv):
+    """A gymnasium MuJoCo environment with a shift.
+
+    :param env: one whose innermost environment has MuJoCo's ``model`` and ``data`` and steps them by ``do_simulation``;
+        with effects or not
+    :param shift: factors and effects, relative to ``env`` as it is
+    :raises ValueError: no MuJoCo environment, names that its model does not have
+    """
+
+    def __init__(self, env: gym.Env, shift: EnvShift | Mapping[str, Any]) -> None:
+        shift = as_shift(shift)
+        RecordConstructorArgs.__init__(self, shift=asdict(shift))  # plain data, for specs as JSON
+        self.shift = shift
+        base: Any = env.unwrapped
+        if not isinstance(getattr(base, "model", None), mujoco.MjModel):
+            raise ValueError(f"{type(base).__name__} is neither a gymnasium MuJoCo environment nor a cart-pole")
+        self._walker_reset = WalkerReset(base)
+        CorrectedEnv.__init__(self, env, shift_effects(shift, env))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "shift": self.shift}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        ShiftedEnv.__init__(self, with_numbers(state["env"], state.get("model")), state["shift"])
+        self.set_effects(state["effects"])

@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_rpto.effects.actuation import command_limits
 from sb3_rpto.effects.engine import quiet
-from sb3_rpto.effects.model import differing
+from sb3_rpto.effects.model_numbers import differing
 from sb3_rpto.envs.env_copy import copy_env
 from sb3_rpto.envs.observations import StateMap, are_known, layers
 

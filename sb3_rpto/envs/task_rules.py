@@ -16,6 +16,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize
@@ -334,8 +335,6 @@ def _inverted_double_pendulum(view: _View) -> TaskRules:
     The simulation rewards the place in its last integration stage, which differs by about 1e-4, and joint speeds
     that the observation clips at 10 rad/s, which healthy poles do not reach.
     """
-    import mujoco
-
     model = view["model"]
     if (model.nq, model.nsite, model.nbody) != (3, 1, 4):
         return TaskRules(None, None)
@@ -388,7 +387,6 @@ def double_pendulum_reward(
 
 
 def _reacher(view: _View) -> TaskRules:
-    import mujoco
 
     model = view["model"]
     data = mujoco.MjData(model)

@@ -1,1 +1,1 @@
-"""Robust Gauss-Newton fits in a box, and what they tell of their parameters."""
+"""One robust Gauss-Newton fit within bounds, for one-step errors and for multiple shooting."""

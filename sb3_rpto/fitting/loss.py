@@ -8,25 +8,48 @@ import numpy as np
 
 #: Typical error, in units of the noise, above which it is the model's more than the noise's.
 FAR = 2.0
+#: The loss turns linear at so many typical residuals: contacts and outliers are borne, noise is squared.
+CLIP = 3.0
 
 
 class Loss(NamedTuple):
-    """Soft-L1, and how firmly the starts are held.
+    """Soft-L1: quadratic for small residuals, linear for large ones.
 
-    :param clip: where the loss of a residual turns linear: at three typical ones, at least three units of noise
+    :param clip: where the loss of a residual turns linear
     """
 
     clip: float
 
-    @property
-    def far(self) -> bool:
-        """Whether the typical residual is the model's more than the noise's."""
-        return self.clip > 3 * FAR
+    @classmethod
+    def of(cls, r: np.ndarray, least: float = 1.0) -> Loss:
+        """The loss that fits residuals of this size: it turns linear at :data:`CLIP` typical ones.
+
+        :param r: residuals of any shape
+        :param least: the typical residual is taken to be this at least. Residuals in units of the noise are not
+            smaller than 1 by more than chance; those in other units may be, up to rounding
+        """
+        return cls(CLIP * max(least, 1.4826 * float(np.median(np.abs(r)))))
 
     @property
-    def hold(self) -> float:
-        """Weight of the starts: where the model errs by more than noise, they must not make up for it."""
-        return (self.clip / 3) ** 2
+    def model_error_dominates(self) -> bool:
+        """Whether the typical residual, in units of the noise, is the model's more than the noise's."""
+        return self.clip > CLIP * FAR
+
+    def cost(self, r: np.ndarray) -> np.ndarray:
+        """Loss of each residual; of small ones the square."""
+        return np.asarray(2 * self.clip**2 * (np.sqrt(1 + (r / self.clip) ** 2) - 1))
+
+    def weights(self, r: np.ndarray, share: float | np.ndarray = 1.0) -> np.ndarray:
+        """Weights of the residuals in the least squares that stand for the loss in a step: these have its slope.
+
+        :param r: residuals
+        :param share: of each residual in the cost, as it broadcasts with ``r``
+        """
+        return np.asarray(share / np.sqrt(1 + (r / self.clip) ** 2))
+
+    def second_derivative(self, r: np.ndarray) -> np.ndarray:
+        """Half of the loss's own second derivative: less than the :meth:`weights`."""
+        return np.asarray((1 + (r / self.clip) ** 2) ** -1.5)
 
     def curvature(self, r: np.ndarray) -> float:
         """How curved the loss is, as a share of the weighted least squares that stand for it in a step.
@@ -36,13 +59,3 @@ class Loss(NamedTuple):
         """
         bent = 1 + (r / self.clip) ** 2
         return float(np.mean(bent**-1.5) / np.mean(bent**-0.5))
-
-    @classmethod
-    def of(cls, r: np.ndarray) -> Loss:
-        """The loss that fits residuals of this size."""
-        return cls(3 * max(1.0, 1.4826 * float(np.median(np.abs(r)))))
-
-    def energy(self, r: np.ndarray, starts: np.ndarray) -> np.ndarray:
-        """Robust sum of squares of each window with its start, (..., W)."""
-        soft = 2 * self.clip**2 * (np.sqrt(1 + (r / self.clip) ** 2) - 1)
-        return soft.sum(-1) + self.hold * (starts**2).sum(-1)

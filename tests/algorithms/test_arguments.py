@@ -485,7 +485,7 @@ def test_a_zip_without_its_suffix_is_found_beside_a_folder_of_that_name(tmp_path
         RPO.load(tmp_path / "model", 3)
 
 
-@pytest.mark.parametrize("given", [pendulum, [pendulum]])
+@pytest.mark.parametrize("given", [3, [pendulum]])
 @pytest.mark.parametrize("name", ["env", "target_env"])
 def test_what_is_no_environment_is_refused(name, given):
     worlds = {"env": pendulum(), "target_env": pendulum(12.0), name: given}
@@ -498,3 +498,11 @@ def test_load_takes_ids_as_the_constructor_does(tmp_path):
     model = RPO.load(tmp_path / "model.zip", "Pendulum-v1", target_env="Pendulum-v1")
     assert model.env is not None
     assert model.target_env is not None
+
+
+def test_environments_may_be_given_by_functions_that_make_them():
+    model = small(RPO, pendulum, lambda: pendulum(12.0))
+    assert model.env.envs[0].unwrapped.g == 10.0
+    assert model.target_env.envs[0].unwrapped.g == 12.0
+    with pytest.raises(TypeError, match="target_env: the function returned int"):
+        small(RPO, pendulum, lambda: 3)

@@ -37,7 +37,7 @@ from sb3_rpto.buffers import chronological
 from sb3_rpto.callbacks import KeepBest
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
 from sb3_rpto.effects import declare
-from sb3_rpto.effects.model import numbers
+from sb3_rpto.effects.model_numbers import numbers
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.envs.task_rules import task_rules
 
@@ -1116,8 +1116,8 @@ def test_a_mujoco_simulator_is_saved_as_text_and_comes_back_to_the_last_bit(tmp_
     model = small(RPTO, env, hopper(-12.0), dynamics="physical", declared=["option.gravity"], dynamics_kwargs={})
     model.save(tmp_path / "m")
     data, _, _ = load_from_zip_file(tmp_path / "m.zip")
-    assert data["dynamics_config"]["model"].text.startswith("<mujoco")
-    ours, theirs = (numbers(m) for m in (env.unwrapped.model, RPTO.load(tmp_path / "m").dynamics.model))
+    assert data["dynamics_config"]["mj_model"].text.startswith("<mujoco")
+    ours, theirs = (numbers(m) for m in (env.unwrapped.model, RPTO.load(tmp_path / "m").dynamics.mj_model))
     for name in ours:
         np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
 

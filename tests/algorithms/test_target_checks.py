@@ -14,7 +14,7 @@ from sb3_rpto import RPTO
 from sb3_rpto.algorithms.target_checks import LARGE, check_machine, doubt_rules
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.effects import declare
-from sb3_rpto.effects.model import sites_act
+from sb3_rpto.effects.model_numbers import sites_act
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.envs.task_rules import task_rules
 

@@ -9,8 +9,8 @@ from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPO
 from sb3_rpto.baselines.slbo import SLBO
+from sb3_rpto.baselines.slbo_dynamics import DeterministicDynamics
 from sb3_rpto.callbacks import RelativityGapCallback
-from sb3_rpto.dynamics.deterministic import DeterministicDynamics
 from sb3_rpto.dynamics.vec_env import DynamicsVecEnv
 
 STAGE = {"iterations": 2, "model_steps": 7, "policy_updates": 3, "rollout_samples": 40, "rollout_length": 20}

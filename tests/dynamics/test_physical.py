@@ -76,7 +76,7 @@ def test_the_config_is_plain_data_of_its_own():
     env.unwrapped.model.body_mass[1] = 99.0
     again = pickle.loads(pickle.dumps(config))
     assert again["frame_skip"] == 4
-    assert again["model"].compile().body_mass[1] == gym.make(HOPPER).unwrapped.model.body_mass[1]
+    assert again["mj_model"].compile().body_mass[1] == gym.make(HOPPER).unwrapped.model.body_mass[1]
     assert again["recover"](np.zeros((2, 11))).qpos.shape == (2, 6)
 
 
@@ -399,11 +399,11 @@ def test_an_mjcf_alone_is_fitted_to_its_states(form, tmp_path):
         rows.append((before, command, 0.0, np.concatenate([state.qpos, state.qvel]), 0.0))
     data = Transitions(*(th.as_tensor(np.array(column)) for column in zip(*rows)))
     states, commands = spaces.Box(-np.inf, np.inf, (2,)), spaces.Box(-1, 1, (1,))
-    fitted = PhysicalDynamics(states, commands, model=model, frame_skip=2, declared=["hinge.damping"])
+    fitted = PhysicalDynamics(states, commands, mj_model=model, frame_skip=2, declared=["hinge.damping"])
     fitted.fit(data)
     assert fitted.describe()["hinge.damping"] == pytest.approx(0.15, rel=1e-6)
     with pytest.raises(ValueError, match=r"shape \(3,\), and states are recovered from 2 numbers; give recover="):
-        PhysicalDynamics(spaces.Box(-1, 1, (3,)), commands, model=model)
+        PhysicalDynamics(spaces.Box(-1, 1, (3,)), commands, mj_model=model)
 
 
 # --- effects in phi ---------------------------------------------------------------------------------------------------

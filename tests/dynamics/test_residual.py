@@ -104,9 +104,9 @@ def test_with_nothing_missing_it_is_the_simulator_exactly(env_id):
 
 
 def test_a_wrong_declared_number_is_left_to_the_simulator():
-    heavy = {"model": gym.make("InvertedPendulum-v5").unwrapped.model.__copy__()}
-    heavy["model"].body("pole").mass *= 1.3
-    heavy["model"].body("pole").inertia *= 1.3
+    heavy = {"mj_model": gym.make("InvertedPendulum-v5").unwrapped.model.__copy__()}
+    heavy["mj_model"].body("pole").mass *= 1.3
+    heavy["mj_model"].body("pole").inertia *= 1.3
     env = gym.make("InvertedPendulum-v5")
     dynamics = ResidualDynamics(
         *(env.observation_space, env.action_space),

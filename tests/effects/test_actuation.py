@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.effects.actuation import joint_torque, memoryless, motors
-from sb3_rpto.effects.world import BatchWorld, LiveWorld
+from sb3_rpto.effects.batch import LiveSimulation, MujocoBatch
 
 XML = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.1" pos="0.2 0 0"/>
 <body pos="0.4 0 0"><joint name="b" type="slide"/><geom size="0.1"/></body></body></worldbody>
@@ -26,14 +26,14 @@ def test_torque_is_mujocos(kind: str, limit: str) -> None:
     on = motors(model, 0)
     assert on is not None
     rng = np.random.default_rng(0)
-    world = BatchWorld(model, 50, 1)
-    world.qpos[:], world.qvel[:] = rng.normal(size=(2, 50, 2))
-    world.ctrl[:] = 2 * rng.normal(size=(50, model.nu))
-    got = joint_torque(world, on, 0, 0)
-    world.batch.forward()
-    np.testing.assert_allclose(got, world.actuation[:, 0], rtol=1e-12, atol=1e-12)
-    live = LiveWorld(model, mujoco.MjData(model))
-    live.qpos[:], live.qvel[:], live.ctrl[:] = world.qpos[0], world.qvel[0], world.ctrl[0]
+    batch = MujocoBatch(model, 50, 1)
+    batch.qpos[:], batch.qvel[:] = rng.normal(size=(2, 50, 2))
+    batch.ctrl[:] = 2 * rng.normal(size=(50, model.nu))
+    got = joint_torque(batch, on, 0, 0)
+    batch.engine.forward()
+    np.testing.assert_allclose(got, batch.actuation[:, 0], rtol=1e-12, atol=1e-12)
+    live = LiveSimulation(model, mujoco.MjData(model))
+    live.qpos[:], live.qvel[:], live.ctrl[:] = batch.qpos[0], batch.qvel[0], batch.ctrl[0]
     np.testing.assert_allclose(joint_torque(live, on, 0, 0), got[:1], rtol=1e-12)
 
 
@@ -45,8 +45,8 @@ def test_memory_and_tendons_fall_back_to_the_substep_before(actuator: str) -> No
     model = mujoco.MjModel.from_xml_string(XML.format(actuator))
     assert not memoryless(model, 0)
     assert motors(model, 0) is None
-    world = BatchWorld(model, 1, 1)
-    world.ctrl[:] = 1.0
-    world.batch.step()
-    world.batch.step()
-    np.testing.assert_array_equal(joint_torque(world, None, 0, 0), world.actuation[:, 0])
+    batch = MujocoBatch(model, 1, 1)
+    batch.ctrl[:] = 1.0
+    batch.engine.step()
+    batch.engine.step()
+    np.testing.assert_array_equal(joint_torque(batch, None, 0, 0), batch.actuation[:, 0])

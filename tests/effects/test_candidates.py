@@ -15,7 +15,7 @@ from sb3_rpto.effects import (
     Parameter,
     Scales,
     Simulation,
-    World,
+    SimulationBatch,
     candidates,
     from_json,
     register,
@@ -197,8 +197,8 @@ def cubic() -> Iterator[type[Effect]]:
         parameters = (Parameter("c", "N·m·s³/rad³", lambda s: 0.03 * s.torque / s.velocity**3, lower=0.0),)
         equation = "-c qd^3"
 
-        def act(self, world: World, x: np.ndarray) -> None:
-            world.force[:, self.dof] -= x[:, 0] * world.qvel[:, self.dof] ** 3
+        def act(self, batch: SimulationBatch, x: np.ndarray) -> None:
+            batch.force[:, self.dof] -= x[:, 0] * batch.qvel[:, self.dof] ** 3
 
     yield CubicDrag
     del LIBRARY["cubic_drag"]
@@ -255,8 +255,8 @@ def test_a_hook_that_fails_is_named_before_a_search(hook: str) -> None:
 def nothing_over_nothing(self: Effect, *arguments: Any) -> Any:
     """Any hook whose equation divides by a speed or a command, at rest."""
     if self.place == "joint":  # act(world, x)
-        world, x = arguments
-        world.force[:, self.dof] -= x[:, 0] * world.qvel[:, self.dof] / np.abs(world.qvel[:, self.dof])
+        batch, x = arguments
+        batch.force[:, self.dof] -= x[:, 0] * batch.qvel[:, self.dof] / np.abs(batch.qvel[:, self.dof])
         return None
     u = arguments[0]
     with np.errstate(invalid="ignore"):
@@ -274,8 +274,8 @@ def test_a_hook_that_makes_no_numbers_is_named_before_a_search(hook: str) -> Non
         try_out(compiled, wrong(wrong.places(compiled)[0]))
 
 
-def first_row_alone(self: Effect, world: Any, x: np.ndarray) -> None:
-    world.force[:, self.dof] -= x[0, 0] * world.qvel[:, self.dof]
+def first_row_alone(self: Effect, batch: Any, x: np.ndarray) -> None:
+    batch.force[:, self.dof] -= x[0, 0] * batch.qvel[:, self.dof]
 
 
 @pytest.mark.parametrize(

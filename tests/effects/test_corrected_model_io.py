@@ -13,8 +13,9 @@ from sb3_rpto.effects import LIBRARY, Declared, Drive, Effect, Parameter, Scales
 from sb3_rpto.effects.bodies import LinkLength
 from sb3_rpto.effects.corrected_model_io import carried_by, correct, load_corrected, save_corrected
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
-from sb3_rpto.effects.model import differing, load_model, numbers
-from sb3_rpto.effects.stance import StandingEnv
+from sb3_rpto.effects.model import load_model
+from sb3_rpto.effects.model_numbers import differing, numbers
+from sb3_rpto.effects.walker_reset import StandingEnv
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.corrected import apply_effects
 
@@ -335,9 +336,9 @@ BALL = '<body name="ball" pos="2 0 .1"><freejoint/><geom type="sphere" size=".1"
 
 
 def test_the_machine_stands_whatever_lies_beside_it_and_what_hangs_is_left_there(tmp_path):
-    world = WORLD.format(wall="").replace('<body name="arm"', BALL + '<body name="arm"')
+    batch = WORLD.format(wall="").replace('<body name="arm"', BALL + '<body name="arm"')
     hanging = WORLD.format(wall="").replace("1 0 .2", "1 0 .9")
-    for xml, start in ((world, 0.2 + 0.2 * 0.15), (hanging, 0.9)):
+    for xml, start in ((batch, 0.2 + 0.2 * 0.15), (hanging, 0.9)):
         (tmp_path / "world.xml").write_text(xml)
         base = StandingEnv(Standing(str(tmp_path / "world.xml")), [LinkLength("foot", change=0.2)]).unwrapped
         assert base.init_qpos[base.model.joint(base.model.body("box").jntadr[0]).qposadr[0] + 2] == pytest.approx(start)

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_rpto.effects import Declared, Scales, declare, parameter_names
+from sb3_rpto.effects.batch import LiveSimulation, MujocoBatch, SimulationBatch
 from sb3_rpto.effects.corrected_model_io import correct
 from sb3_rpto.effects.library import candidates
-from sb3_rpto.effects.world import BatchWorld, LiveWorld, World
 
 MODEL = mujoco.MjModel.from_xml_string("""
 <mujoco>
@@ -218,11 +218,11 @@ def test_every_name_can_be_declared() -> None:
             assert declared.label == name
 
 
-def written(world: World, name: str, value: float) -> World:
-    world.restore()
-    Declared(MODEL, name, (0.0, np.inf)).write(world, np.array([[value]]))
-    world.settle()
-    return world
+def written(batch: SimulationBatch, name: str, value: float) -> SimulationBatch:
+    batch.restore()
+    Declared(MODEL, name, (0.0, np.inf)).write(batch, np.array([[value]]))
+    batch.settle()
+    return batch
 
 
 @pytest.mark.parametrize(
@@ -249,40 +249,40 @@ def written(world: World, name: str, value: float) -> World:
     ],
 )
 def test_writing(name: str, value: float, field: str, where: tuple[int, ...], expected: float) -> None:
-    for world in (BatchWorld(MODEL, 1, 1), LiveWorld(MODEL.__copy__(), mujoco.MjData(MODEL))):
+    for batch in (MujocoBatch(MODEL, 1, 1), LiveSimulation(MODEL.__copy__(), mujoco.MjData(MODEL))):
         at = (0, *where) if isinstance(where, tuple) else (0, where)
-        before = float(world.field(field)[at])
-        assert written(world, name, value).field(field)[at] == pytest.approx(expected)
-        world.restore()
-        assert world.field(field)[at] == before
+        before = float(batch.field(field)[at])
+        assert written(batch, name, value).field(field)[at] == pytest.approx(expected)
+        batch.restore()
+        assert batch.field(field)[at] == before
 
 
 def test_plain_numbers_reach_the_model() -> None:
     model = MODEL.__copy__()
-    world = LiveWorld(model, mujoco.MjData(model))
-    written(world, "option.density", 40.0)
+    batch = LiveSimulation(model, mujoco.MjData(model))
+    written(batch, "option.density", 40.0)
     assert model.opt.density == 40.0
-    world.restore()
+    batch.restore()
     assert model.opt.density == 1.2
 
 
 def test_a_velocity_servo_stays_one_whose_gain_is_fitted() -> None:
     model = MODEL.__copy__()
-    for world in (BatchWorld(MODEL, 1, 1), LiveWorld(model, mujoco.MjData(model))):
+    for batch in (MujocoBatch(MODEL, 1, 1), LiveSimulation(model, mujoco.MjData(model))):
         for name, value in (("speed.gain", 4.0), ("speed.kv", 2.0)):
-            Declared(MODEL, name).write(world, np.array([[value]]))
-        assert world.field("actuator_gainprm")[0, 2, 0] == 2.0
+            Declared(MODEL, name).write(batch, np.array([[value]]))
+        assert batch.field("actuator_gainprm")[0, 2, 0] == 2.0
 
 
 @given(st.floats(0.15, 9))
 def test_mass_scales_inertia_and_inertia_leaves_mass(factor: float) -> None:
     body = MODEL.body("arm").id
     mass, inertia = MODEL.body_mass[body], MODEL.body_inertia[body]
-    heavy = written(BatchWorld(MODEL, 1, 1), "arm.mass", factor * mass)
+    heavy = written(MujocoBatch(MODEL, 1, 1), "arm.mass", factor * mass)
     np.testing.assert_allclose(heavy.field("body_mass")[0, body], factor * mass)
     np.testing.assert_allclose(heavy.field("body_inertia")[0, body], factor * inertia)
-    round_ = written(BatchWorld(MODEL, 1, 1), "arm.inertia", factor * inertia[0])
-    assert round_.batch.expand("body_mass")[0, body] == mass
+    round_ = written(MujocoBatch(MODEL, 1, 1), "arm.inertia", factor * inertia[0])
+    assert round_.engine.expand("body_mass")[0, body] == mass
     np.testing.assert_allclose(round_.field("body_inertia")[0, body], factor * inertia)
 
 
@@ -294,10 +294,10 @@ def test_the_range_of_a_joint_keeps_the_reference_pose_or_the_bound_next_to_it()
     assert {d.label: d.values[0] for d in found} == pytest.approx(
         {"around.range": 1.5, "away.range": 0.6, "moved.range": 2}
     )
-    world = BatchWorld(model, 2, 1)
+    batch = MujocoBatch(model, 2, 1)
     for parameter in found:
-        parameter.write(world, parameter.values * np.array([[0.5], [2.0]]))
-    half, double = world.field("jnt_range")
+        parameter.write(batch, parameter.values * np.array([[0.5], [2.0]]))
+    half, double = batch.field("jnt_range")
     np.testing.assert_allclose(half[:3], [(-0.5, 0.25), (0.4, 0.7), (1.5, 2.5)])
     np.testing.assert_allclose(double[:3], [(-2, 1), (0.4, 1.6), (0, 4)])
     with pytest.raises(ValueError, match=r"free\.range is 0 in the model"):
@@ -314,11 +314,11 @@ def test_it_pickles(name: str) -> None:
         moved.parameters[0].size_for(Scales()),
         known.nominal,
     )
-    worlds = BatchWorld(MODEL, 1, 1), BatchWorld(MODEL, 1, 1)
-    for effect, world in zip((moved, twin), worlds):
-        effect.write(world, effect.values[None])
+    batches = MujocoBatch(MODEL, 1, 1), MujocoBatch(MODEL, 1, 1)
+    for effect, batch in zip((moved, twin), batches):
+        effect.write(batch, effect.values[None])
     for field in ("dof_damping", "body_mass", "opt.gravity", "jnt_stiffness"):
-        np.testing.assert_array_equal(worlds[0].field(field), worlds[1].field(field))
+        np.testing.assert_array_equal(batches[0].field(field), batches[1].field(field))
 
 
 @pytest.mark.parametrize("names", [["motor.strength", "motor.gain"], ["motor.gain", "motor.strength"]])

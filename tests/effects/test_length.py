@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sb3_rpto.effects import LIBRARY, Declared
+from sb3_rpto.effects.batch import LiveSimulation, MujocoBatch
 from sb3_rpto.effects.inertia import from_tensor, matrices, to_tensor
 from sb3_rpto.effects.length import link_length, write_length
-from sb3_rpto.effects.world import BatchWorld, LiveWorld
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -64,27 +64,27 @@ def test_stretched_equals_recompiled(file: str, name: str, scale: float) -> None
     model, expected = recompiled(ASSETS / file, name, scale)
     body = model.body(name).id
     nominal = link_length(model, body)
-    world = BatchWorld(model, 2, 1)
-    outputs = {n: world.batch.bind(n) for n in ("qacc", "geom_xpos", "site_xpos", "xanchor")}
-    write_length(world, body, np.array([nominal, scale * nominal]), nominal)
-    world.settle()
+    batch = MujocoBatch(model, 2, 1)
+    outputs = {n: batch.engine.bind(n) for n in ("qacc", "geom_xpos", "site_xpos", "xanchor")}
+    write_length(batch, body, np.array([nominal, scale * nominal]), nominal)
+    batch.settle()
 
     np.testing.assert_allclose(link_length(expected, body), scale * nominal, rtol=1e-12)
     for field in ("body_mass", "body_ipos", "body_subtreemass", "geom_size", "geom_pos", "geom_rbound", "body_pos"):
-        np.testing.assert_allclose(world.field(field)[1], getattr(expected, field), rtol=1e-9, atol=1e-12)
-    tensor = to_tensor(world.field("body_inertia")[1], world.field("body_iquat")[1])
+        np.testing.assert_allclose(batch.field(field)[1], getattr(expected, field), rtol=1e-9, atol=1e-12)
+    tensor = to_tensor(batch.field("body_inertia")[1], batch.field("body_iquat")[1])
     np.testing.assert_allclose(tensor, to_tensor(expected.body_inertia, expected.body_iquat), rtol=1e-9, atol=1e-12)
     for field in ("body_mass", "body_ipos", "body_iquat", "body_inertia", "geom_quat", "jnt_pos"):
-        assert np.array_equal(world.field(field)[0], getattr(model, field)), "the nominal length changes nothing"
+        assert np.array_equal(batch.field(field)[0], getattr(model, field)), "the nominal length changes nothing"
 
     rng = np.random.default_rng(0)
     data = mujoco.MjData(expected)
     for _ in range(5):
         data.qpos[:], data.qvel[:] = model.qpos0 + 0.3 * rng.normal(size=model.nq), rng.normal(size=model.nv)
-        world.qpos[:], world.qvel[:] = data.qpos, data.qvel
+        batch.qpos[:], batch.qvel[:] = data.qpos, data.qvel
         data.qacc_warmstart[:] = 0
         mujoco.mj_forward(expected, data)
-        world.batch.forward()
+        batch.engine.forward()
         for output, values in outputs.items():
             # Contacts amplify rounding.
             np.testing.assert_allclose(values[1], getattr(data, output), rtol=1e-5, atol=1e-8)
@@ -96,11 +96,11 @@ def test_distances_between_joints_are_scaled(scale: float) -> None:
     model = mujoco.MjModel.from_xml_path(str(ASSETS / "hopper.xml"))
     before, data = mujoco.MjData(model), mujoco.MjData(model)
     mujoco.mj_forward(model, before)
-    world = LiveWorld(model, data)
+    batch = LiveSimulation(model, data)
     for name in ("torso", "thigh", "leg", "foot"):
         nominal = link_length(model, model.body(name).id)
-        write_length(world, model.body(name).id, np.array([scale * nominal]), nominal)
-    world.settle()
+        write_length(batch, model.body(name).id, np.array([scale * nominal]), nominal)
+    batch.settle()
     mujoco.mj_forward(model, data)
     joints = [model.joint(name).id for name in ("rooty", "thigh_joint", "leg_joint", "foot_joint")]
     for one, next_one in pairwise(joints):
@@ -124,12 +124,12 @@ def test_inertia_of_offset_balls_and_boxes() -> None:
     <geom type="ellipsoid" pos="0 0 {1}" size="0.05 0.02 0.07"/>
     </body></worldbody></mujoco>"""
     model, longer = (mujoco.MjModel.from_xml_string(xml.format(0.4 * s, 0.2 * s)) for s in (1, 1.5))
-    world = BatchWorld(model, 1, 1)
-    write_length(world, 1, np.array([0.6]), 0.4)
-    np.testing.assert_allclose(world.field("body_mass")[0], longer.body_mass, rtol=1e-12)
-    np.testing.assert_allclose(world.field("body_ipos")[0], longer.body_ipos, atol=1e-12)
+    batch = MujocoBatch(model, 1, 1)
+    write_length(batch, 1, np.array([0.6]), 0.4)
+    np.testing.assert_allclose(batch.field("body_mass")[0], longer.body_mass, rtol=1e-12)
+    np.testing.assert_allclose(batch.field("body_ipos")[0], longer.body_ipos, atol=1e-12)
     np.testing.assert_allclose(
-        to_tensor(world.field("body_inertia")[0, 1:], world.field("body_iquat")[0, 1:]),
+        to_tensor(batch.field("body_inertia")[0, 1:], batch.field("body_iquat")[0, 1:]),
         to_tensor(longer.body_inertia[1:], longer.body_iquat[1:]),
         rtol=1e-9,
         atol=1e-12,
@@ -152,12 +152,12 @@ def test_declared_length_and_effect_are_the_same() -> None:
     model = mujoco.MjModel.from_xml_path(str(ASSETS / "inverted_double_pendulum.xml"))
     declared, effect = Declared(model, "pole.length"), LIBRARY["link_length"]("pole")
     effect.bind(model)
-    worlds = BatchWorld(model, 1, 1), BatchWorld(model, 1, 1)
-    declared.write(worlds[0], np.array([[0.72]]))
-    effect.write(worlds[1], np.array([[0.2]]))
+    batches = MujocoBatch(model, 1, 1), MujocoBatch(model, 1, 1)
+    declared.write(batches[0], np.array([[0.72]]))
+    effect.write(batches[1], np.array([[0.2]]))
     for field in ("body_mass", "body_inertia", "body_pos", "geom_size"):
-        np.testing.assert_allclose(worlds[0].field(field), worlds[1].field(field), rtol=1e-12)
-    assert worlds[0].field("body_pos")[0, 3, 2] == pytest.approx(0.72)
+        np.testing.assert_allclose(batches[0].field(field), batches[1].field(field), rtol=1e-12)
+    assert batches[0].field("body_pos")[0, 3, 2] == pytest.approx(0.72)
 
 
 def test_principal_frames_invert() -> None:
@@ -193,10 +193,10 @@ def test_drag_does_not_jump_with_the_length() -> None:
     accelerations = []
     for scale in (0.87, 0.8703, 0.87035):  # at 0.8703 rounding turns the frame that an eigensolver finds
         stretched, data = model.__copy__(), mujoco.MjData(model)
-        world = LiveWorld(stretched, data)
+        batch = LiveSimulation(stretched, data)
         for body in (1, 2, 3):
-            write_length(world, body, np.array([scale * link_length(model, body)]), link_length(model, body))
-        world.settle()
+            write_length(batch, body, np.array([scale * link_length(model, body)]), link_length(model, body))
+        batch.settle()
         data.qvel[:] = np.random.default_rng(0).normal(size=model.nv)
         mujoco.mj_forward(stretched, data)
         accelerations.append(data.qacc.copy())

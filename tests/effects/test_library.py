@@ -10,9 +10,9 @@ import pytest
 from scipy.optimize import least_squares
 
 from sb3_rpto.effects import LIBRARY, Drive, Effect, Scales, Simulation, from_json
+from sb3_rpto.effects.batch import MujocoBatch
 from sb3_rpto.effects.sensors import ago
 from sb3_rpto.effects.simulation import prepare
-from sb3_rpto.effects.world import BatchWorld
 
 ARM = mujoco.MjModel.from_xml_string("""
 <mujoco>
@@ -464,10 +464,10 @@ def test_a_servo_on_a_tendon_regulates_what_its_joints_sensors_show() -> None:
 
     def biases(tendon: str, *effects: Effect) -> list[float]:
         model = mujoco.MjModel.from_xml_string(text % tendon)
-        world = BatchWorld(model, 1, 1)
+        batch = MujocoBatch(model, 1, 1)
         sim = Simulation(model, list(effects), 1)
-        prepare(world, sim.active(sim.values()[None]))
-        return world.batch.get_model(0).actuator_biasprm[0, :2].tolist()
+        prepare(batch, sim.active(sim.values()[None]))
+        return batch.engine.get_model(0).actuator_biasprm[0, :2].tolist()
 
     offset, gain = LIBRARY["sensor_bias"], LIBRARY["sensor_gain"]
     assert biases("one", offset("j", offset=0.1)) == pytest.approx([-50 * 1.5 * 2 * 0.1, -50])

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_rpto.effects import LIBRARY, Drive, Effect, Simulation, declare
+from sb3_rpto.effects.batch import MujocoBatch
 from sb3_rpto.effects.simulation import alike, memory, names_of, settled
-from sb3_rpto.effects.world import BatchWorld
 
 XML = """
 <mujoco>
@@ -129,7 +129,7 @@ def test_an_effect_at_rest_leaves_nothing_behind_to_copy_in_every_step() -> None
     expanded = []
     for viscous, armature in ((0.1, 0.0), (0.0, 0.01), (0.0, 0.0)):
         simulation.rollout(np.tile([viscous, armature], (3, 1)), qpos, qvel, Drive(commands))
-        batch = list(simulation._worlds.values())[-1].batch
+        batch = list(simulation._batches.values())[-1].engine
         expanded.append([name for name in ("dof_damping", "dof_armature") if batch.expanded(name) is not None])
     assert expanded == [["dof_damping"], ["dof_armature"], []]
 
@@ -412,18 +412,18 @@ def test_constants_follow_from_the_fields_of_each_simulation_whatever_others_sha
     rng, n = np.random.default_rng(3), 9
     kinds = rng.integers(0, 4, n)
     mass, place = rng.uniform(0.5, 2.0, (4, MODEL.nbody)), rng.normal(size=(4, MODEL.nbody, 3))
-    world = BatchWorld(MODEL, n, 1)
+    batch = MujocoBatch(MODEL, n, 1)
     for _ in range(2):  # what was derived before does not stay
-        world.restore()
-        world.field("body_mass")[:] *= mass[kinds]
-        world.field("body_pos")[:] += place[kinds]
-        world.settle()
+        batch.restore()
+        batch.field("body_mass")[:] *= mass[kinds]
+        batch.field("body_pos")[:] += place[kinds]
+        batch.settle()
         for i, kind in enumerate(kinds):
             model = MODEL.__copy__()
             model.body_mass[:] *= mass[kind]
             model.body_pos[:] += place[kind]
             mujoco.mj_setConst(model, mujoco.MjData(model))
-            derived = world.batch.get_model(i)
+            derived = batch.engine.get_model(i)
             for name in ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0"):
                 np.testing.assert_array_equal(getattr(derived, name), getattr(model, name))
         mass, place = mass[::-1], place[::-1]

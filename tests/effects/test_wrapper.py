@@ -55,8 +55,8 @@ class Clock(Effect):
     kind, place, equation = "test_clock", "joint", "a sin(500 t)"
     parameters = (Parameter("a", "N", 0.1),)
 
-    def act(self, world, x):
-        world.force[:, self.dof] += x[:, 0] * np.sin(500 * world.time)
+    def act(self, batch, x):
+        batch.force[:, self.dof] += x[:, 0] * np.sin(500 * batch.time)
 
 
 class Bias(Effect):
@@ -104,8 +104,8 @@ def test_the_substeps_are_gymnasiums(name):
     class Nothing(Clock):
         kind, place = "test_nothing", "world"  # on a joint it would make the dry friction there stiffer
 
-        def act(self, world, x):
-            world.force[:] += 0.0
+        def act(self, batch, x):
+            batch.force[:] += 0.0
 
     bare, wrapped = gym.make(name), CorrectedEnv(gym.make(name), [Nothing(a=1.0)])
     actions = actions_for(bare, 40)

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_rpto import RPTO
 from sb3_rpto.effects import LIBRARY, Declared, Effect, Parameter, declare
 from sb3_rpto.effects.friction import CoulombFriction, StribeckFriction
-from sb3_rpto.effects.model import differing
+from sb3_rpto.effects.model_numbers import differing
 from sb3_rpto.effects.wrapper import CorrectedEnv
 from sb3_rpto.envs.corrected import apply_effects, check_carries
 from sb3_rpto.envs.env_copy import copy_env

@@ -1,4 +1,4 @@
-"""What looks into the simulation of an environment looks into its copy's in a copy."""
+"""Copies look into their own simulation, or are refused, or are made anew by the function that made the original."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_rpto.algorithms.rollouts import copied
 from sb3_rpto.effects import LIBRARY
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.envs.env_copy import copy_env, must_copy
+from sb3_rpto.envs.env_copy import CopyError, copy_env, make_env, must_copy
 
 
 class Arm:
@@ -125,18 +125,9 @@ class Opaque(Tilting):
         return lambda: self.data.qpos[1]
 
 
-WORLDS = [
-    Helper,
-    View,
-    Closure,
-    OverData,
-    HeldByAFunction,
-    Default,
-    Partial,
-    Named,
-    NamedBeside,
-    lambda: Watching(gym.make("InvertedPendulum-v5").unwrapped),
-]
+#: those that copy, and those that look into the simulation in ways that a copy would not follow
+COPIED = [Helper, Partial, lambda: Watching(gym.make("InvertedPendulum-v5").unwrapped)]
+REFUSED = [View, Closure, OverData, HeldByAFunction, Default, Named, NamedBeside]
 
 
 def episode(env: gym.Env) -> list[tuple]:
@@ -147,7 +138,7 @@ def episode(env: gym.Env) -> list[tuple]:
     return [(*step[0].tolist(), *step[1:4]) for step in steps]
 
 
-@pytest.mark.parametrize("make", WORLDS)
+@pytest.mark.parametrize("make", COPIED)
 def test_copies_see_their_own_simulation(make) -> None:
     env = make()
     copy, again = copy_env(env), copy_env(env)
@@ -159,13 +150,46 @@ def test_copies_see_their_own_simulation(make) -> None:
     assert episode(again) == expected
 
 
-def test_the_copy_of_a_view_of_the_model_is_one_of_the_copied_model() -> None:
-    env = InvertedPendulumEnv()
-    env.masses = env.model.body_mass[1:]
+@pytest.mark.parametrize("make", REFUSED)
+def test_what_a_copy_would_not_follow_is_refused_unless_a_function_makes_it(make) -> None:
+    assert copy_env(make()) is None
+    with pytest.raises(CopyError, match="pass a function that makes it, or an id"):
+        must_copy(make())
+    expected = episode(make())
+    env = make_env(make)
+    env.reset(seed=0)
+    copy, around = copy_env(env), copy_env(Watching(env))
+    for one in (copy, around, copy_env(copy), env):
+        assert episode(one) == expected
+
+
+def test_a_copy_by_a_function_goes_on_from_where_the_original_is() -> None:
+    env = make_env(Closure)
+    env.model.body_mass[1] *= 2
+    env.reset(seed=3)
+    env.step(np.ones(1))
     copy = copy_env(env)
-    copy.masses[0] = 3.0
-    assert copy.model.body_mass[1] == 3.0
-    assert env.model.body_mass[1] != 3.0
+    assert copy is not env
+    np.testing.assert_array_equal(copy.model.body_mass, env.model.body_mass)
+    for one in (copy, env):  # with the same random numbers later
+        one.seen = [one.step(np.ones(1))[0].tolist(), one.reset()[0].tolist()]
+    assert copy.seen == env.seen
+
+
+def test_functions_over_plain_values_are_shared_with_a_copy() -> None:
+    scale, shift = 2.0, np.ones(4)
+    env = gym.wrappers.TransformObservation(Helper(), lambda obs: scale * obs + shift, None)
+    assert episode(copy_env(env)) == episode(env)
+
+
+def test_an_environment_is_made_of_an_id_a_function_or_itself() -> None:
+    env = Helper()
+    assert make_env(env) is env
+    assert make_env("InvertedPendulum-v5").spec.id == "InvertedPendulum-v5"
+    assert isinstance(make_env(Helper), Helper)
+    assert isinstance(make_env(lambda: DummyVecEnv([Helper])), DummyVecEnv)
+    with pytest.raises(TypeError, match="target_env: the function returned int; it must return a new environment"):
+        make_env(lambda: 3, "target_env")
 
 
 def test_a_corrected_environment_ends_and_rewards_by_its_own_simulation() -> None:
@@ -176,18 +200,9 @@ def test_a_corrected_environment_ends_and_rewards_by_its_own_simulation() -> Non
     assert rows != episode(Helper())
 
 
-def test_the_copy_of_what_mujoco_names_is_of_the_copied_model() -> None:
-    env = InvertedPendulumEnv()
-    env.cart = env.model.body("cart")
-    copy = copy_env(env)
-    copy.cart.mass[0] = 3.0
-    assert copy.model.body("cart").mass[0] == 3.0
-    assert env.model.body("cart").mass[0] != 3.0
-
-
 def test_what_does_not_copy_is_named() -> None:
     assert copy_env(Opaque()) is None
-    with pytest.raises(TypeError, match="generator"):
+    with pytest.raises(CopyError, match="generator"):
         must_copy(Opaque())
     with pytest.raises(ValueError, match=r"cannot be copied \(.*generator.*whose environment holds nothing that"):
         copied(DummyVecEnv([Opaque]))

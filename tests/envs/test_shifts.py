@@ -14,7 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_rpto.effects import LIBRARY, Declared
 from sb3_rpto.effects.inertia import matrices, to_tensor
-from sb3_rpto.effects.model import numbers
+from sb3_rpto.effects.model_numbers import numbers
 from sb3_rpto.effects.wrapper import CorrectedEnv, corrections
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.envs.env_copy import copy_env

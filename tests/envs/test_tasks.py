@@ -17,7 +17,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.effects.corrected_model_io import load_corrected, save_corrected
-from sb3_rpto.effects.model import load_model, numbers
+from sb3_rpto.effects.model import load_model
+from sb3_rpto.effects.model_numbers import numbers
 from sb3_rpto.envs import tasks
 from sb3_rpto.envs.env_snapshot import restore_state, save_state
 from sb3_rpto.envs.observations import state_map

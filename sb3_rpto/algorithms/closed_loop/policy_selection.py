@@ -10,7 +10,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from sb3_rpto.algorithms.rollouts import copied
 from sb3_rpto.algorithms.transition_checks import check_finite
 from sb3_rpto.dynamics.physical import PhysicalDynamics
-from sb3_rpto.effects.stance import StandingEnv
+from sb3_rpto.effects.walker_reset import StandingEnv
 
 if TYPE_CHECKING:
     from sb3_rpto.algorithms.closed_loop.looping import Looping

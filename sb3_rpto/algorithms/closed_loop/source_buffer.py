@@ -19,7 +19,7 @@ def outdated(model: Looping, dynamics: PhysicalDynamics) -> bool:
     """
     side, lead = model.replay_buffer.source, 0
     if side.full:
-        lead = min(remembered(dynamics.model, dynamics.frame_skip) * int(model.source_steps), side.size() // 2)
+        lead = min(remembered(dynamics.mj_model, dynamics.frame_skip) * int(model.source_steps), side.size() // 2)
     return dynamics.error(model.transitions("source").take(slice(lead + OLDEST)), lead=lead) > OTHER
 
 

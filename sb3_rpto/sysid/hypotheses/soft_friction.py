@@ -88,7 +88,7 @@ def share_of_creeping(
     places = [s for e, s in zip(simulation.effects, simulation.slices) if e in there]
     free = np.concatenate([np.arange(s.start, s.stop) for s in places])
     model = simulation.model.__copy__()
-    # A joint that has some keeps its own constraint, see World.rough.
+    # A joint that has some keeps its own constraint, see SimulationBatch.rough.
     model.dof_frictionloss[[e.dof for e in firm]] = settings.little_friction
     soft = Simulation(model, simulation.effects, simulation.nthread)
     fit = Problem(soft, problem.windows, problem.scales).fit(values, free, iterations=settings.iterations)

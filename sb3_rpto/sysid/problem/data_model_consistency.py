@@ -12,9 +12,9 @@ from scipy.signal import savgol_filter
 
 from sb3_rpto.effects import Declared, Simulation
 from sb3_rpto.effects.actuation import FILTERS
+from sb3_rpto.effects.batch import MujocoBatch
 from sb3_rpto.effects.names import near, object_id, object_names
 from sb3_rpto.effects.simulation import prepare
-from sb3_rpto.effects.world import BatchWorld
 from sb3_rpto.sysid.data.angle_units import check_degrees, large_angles
 from sb3_rpto.sysid.data.columns import columns_of, joint_of
 from sb3_rpto.sysid.data.inverse_dynamics_terms import actuation, inverse, through, window_of
@@ -365,9 +365,9 @@ def _forces(model: mujoco.MjModel, data: Measurements, settings: ConsistencySett
         model = nominal
         if episode.params:  # a motor may turn the other way in a run that says so
             known = {name: np.array([value]) for name, value in episode.params.items()}
-            world = BatchWorld(nominal, 1, 1)
+            world = MujocoBatch(nominal, 1, 1)
             prepare(world, simulation.from_settings(known))
-            model = world.batch.get_model(0)
+            model = world.engine.get_model(0)
         time = episode.time[rows]
         step = float(np.median(np.diff(time)))
         window = window_of(step, data.exact)

@@ -11,9 +11,9 @@ from scipy.ndimage import maximum_filter1d
 from scipy.signal import butter, filtfilt
 
 from sb3_rpto.effects import Declared, Effect, Scales, Simulation
+from sb3_rpto.effects.batch import LiveSimulation, MujocoBatch
 from sb3_rpto.effects.names import SCALAR_JOINTS
 from sb3_rpto.effects.simulation import Active, Switch, collect, filter_commands, names_of, prepare, pushing, settled
-from sb3_rpto.effects.world import BatchWorld, LiveWorld
 from sb3_rpto.sysid.data.coordinates import straight, velocity_addresses
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
@@ -82,7 +82,7 @@ def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e:
     commands, enabled = _commands(simulation.model, data, e, time, h)
     commands = filter_commands(active, commands[None], h)[0]
     settings = simulation.from_settings({name: np.array([value]) for name, value in e.params.items()})
-    world = BatchWorld(simulation.model, 1, 1)
+    world = MujocoBatch(simulation.model, 1, 1)
     prepare(world, [*settings, *active])
     needed, load, known, touches = _forces(world, pushing(active), qpos, qvel, commands, enabled, h)
     load, known = (np.stack([low(column) for column in forces.T], axis=1) for forces in (load, known))
@@ -150,7 +150,7 @@ def _commands(
 
 
 def _forces(
-    world: BatchWorld,
+    world: MujocoBatch,
     acting: Active,
     qpos: np.ndarray,
     qvel: np.ndarray,
@@ -160,13 +160,13 @@ def _forces(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
     """Generalised forces, (T, nv) each: needed by the motion, of the actuators, of effects and friction; any touch.
 
-    :param world: one world, its model prepared; dry friction and joint limits are taken out of it
+    :param batch: one world, its model prepared; dry friction and joint limits are taken out of it
     :param acting: effects that push
     """
     qacc = np.gradient(qvel, h, axis=0)
     # The motion at a sample answers to the commands held before and after it alike.
     around = 0.5 * (commands + np.concatenate([commands[:1], commands[:-1]]))
-    model = world.batch.get_model(0)
+    model = world.engine.get_model(0)
     friction = model.dof_frictionloss.copy()
     # Dry friction as a constraint answers to every ripple of a differentiated position: its level is taken below.
     model.dof_frictionloss[:] = 0
@@ -175,7 +175,7 @@ def _forces(
     mj.act[:] = settled(model, around[:1])[0]
     # Actuators with a memory are led along the motion by the simulator's own steps.
     substeps = max(1, round(h / model.opt.timestep)) if model.na or model.nhistory else 0
-    switch = Switch(LiveWorld(model, mj), None if enabled.all() else enabled[None])
+    switch = Switch(LiveSimulation(model, mj), None if enabled.all() else enabled[None])
     needed, load, known = (np.zeros_like(qvel) for _ in range(3))
     touches = False
     for t in range(len(qvel)):

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 from sb3_rpto.effects import Simulation
+from sb3_rpto.effects.batch import MujocoBatch
 from sb3_rpto.effects.simulation import prepare
-from sb3_rpto.effects.world import BatchWorld
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
 from sb3_rpto.sysid.data.signal_quality import MIN_ROWS
@@ -63,10 +63,10 @@ def _rows(r: ForceResidual, rows: np.ndarray) -> ForceResidual:
 
 def _inertia(simulation: Simulation, values: np.ndarray, windows: Windows) -> np.ndarray:
     """The mass matrix at each window's start, (W, nv, nv)."""
-    world = BatchWorld(simulation.model, 1, 1)
+    world = MujocoBatch(simulation.model, 1, 1)
     settings = {name: value[:1] for name, value in windows.drive.settings.items()}
     prepare(world, [*simulation.from_settings(settings), *simulation.active(values[None])])
-    model = world.batch.get_model(0)
+    model = world.engine.get_model(0)
     mj, full = mujoco.MjData(model), np.zeros((len(windows), model.nv, model.nv))
     for w, qpos in enumerate(windows.qpos):
         mj.qpos[:] = qpos

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
 
-from sb3_rpto.dynamics.identifiable import entangled, null_directions, to_hold
+from sb3_rpto.fitting.covariance import correlations, half_widths, regularised_inverse
+from sb3_rpto.fitting.identifiability import confounded_parameters, null_directions, parameters_to_fix
 from sb3_rpto.fitting.loss import Loss
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.selection.search import SearchResult
 from sb3_rpto.sysid.selection.stepwise_selection import Selection, Selector
 from sb3_rpto.sysid.settings import DEFAULTS, SelectionSettings
-from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Linear, Problem
+from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
 from sb3_rpto.sysid.shooting.trimmed_refinement import NOTHING
 
 
@@ -85,54 +85,13 @@ def fit_with_intervals(
         values[hidden] = problem.null[hidden]
         r = problem.residuals(np.tile(fit.values, (len(joined), 1)), fit.starts, np.arange(len(joined)))
         r = r[np.repeat(joined.usable, joined.measured.shape[2], axis=1)]
-        widths = half_widths(linear, joined.block, settings.interval_blocks)
+        widths = half_widths(linear.normal, linear.gradient, joined.block, settings.interval_blocks)
         half = widths * problem.size[free] / Loss.of(r).curvature(r)
         intervals[:, free] = fit.values[free] + np.array([-1, 1])[:, None] * half
         intervals = np.clip(intervals, problem.lower, problem.upper)
         intervals[:, hidden] = intervals[:, alike] = np.nan
-        inverse = _inverse(linear.normal.sum(0))
-        correlation[np.ix_(free, free)] = correlations(inverse)
+        correlation[np.ix_(free, free)] = correlations(regularised_inverse(linear.normal.sum(0)))
     return values, intervals, correlation
-
-
-def correlations(covariance: np.ndarray) -> np.ndarray:
-    """The correlations of a covariance (f, f): symmetric, from -1 to 1, and 1 on the diagonal, whatever its rounding.
-
-    :param covariance: positive on the diagonal
-    """
-    size = np.sqrt(np.diag(covariance))
-    found = np.clip((covariance + covariance.T) / (2 * np.outer(size, size)), -1, 1)
-    np.fill_diagonal(found, 1.0)
-    return np.asarray(found)
-
-
-def half_widths(linear: Linear, block: np.ndarray, least: float = DEFAULTS.selection.interval_blocks) -> np.ndarray:
-    r"""Half-widths of 95 % intervals of the free parameters at a fit, in plausible sizes, (f,).
-
-    Errors within a block go together, those of different blocks do not. So the estimate's variance is that of the sum
-    of the blocks' moves, :math:`H^{-1} \sum_b g_b g_b^T H^{-1}` with the gradients :math:`g_b` (Liang and Zeger 1986).
-    It rests on few blocks where few of them tell a parameter; then it is uncertain itself, and the interval is that of
-    t with Satterthwaite's degrees of freedom (1946), less one for the mean.
-
-    :param linear: the cost around the fit
-    :param block: number of the block of each window, (W,)
-    :param least: blocks that must tell a parameter
-    :return: NaN where fewer do
-    """
-    inverse = _inverse(linear.normal.sum(0))
-    members = [block == b for b in np.unique(block)]
-    gradients = np.stack([linear.gradient[m].sum(0) for m in members])
-    # The mean gradient is not quite zero at a bound; only its scatter matters.
-    moves = (gradients - gradients.mean(0)) @ inverse
-    told = np.stack([np.einsum("fi,ij,jf->f", inverse, linear.normal[m].sum(0), inverse) for m in members])
-    count = told.sum(0) ** 2 / np.maximum((told**2).sum(0), np.finfo(float).tiny)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        spread = np.sqrt((moves**2).sum(0) * count / (count - 1)) * student.ppf(0.975, np.maximum(count - 1, 1))
-    return np.where(count < least, np.nan, spread)
-
-
-def _inverse(normal: np.ndarray) -> np.ndarray:
-    return np.linalg.inv(normal + 1e-9 * np.eye(len(normal)) * max(1e-12, float(np.trace(normal))))
 
 
 def not_told_apart(problem: Problem, fit: Fit, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -152,5 +111,5 @@ def not_told_apart(problem: Problem, fit: Fit, free: np.ndarray) -> tuple[np.nda
     order = np.argsort(given, kind="stable")  # the last is held: something that was given, where there is one
     size = np.diag(normal)[order]
     directions = null_directions(normal[np.ix_(order, order)], size > NOTHING * size.max())
-    held = to_hold(directions) & given[order]
-    return free[order[entangled(directions)]], free[order[held]]
+    held = parameters_to_fix(directions) & given[order]
+    return free[order[confounded_parameters(directions)]], free[order[held]]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from sb3_rpto.dynamics.box import bounded_step, stepped
+from sb3_rpto.fitting.gauss_newton import add_step, bounded_step
 from sb3_rpto.sysid.settings import DEFAULTS, ComparisonSettings
 from sb3_rpto.sysid.shooting.multiple_shooting import Fit, Problem
 from sb3_rpto.sysid.shooting.windows import Windows
@@ -152,5 +152,5 @@ def unseen_errors(
             normal = normal + np.diag(1e-3 * np.diag(normal) + prior)
             step = bounded_step(normal, gradient, low, high) * problem.size[free]
             begin, lower, upper = (x[free] for x in (fit.values, problem.lower, problem.upper))
-            rows[np.ix_(judged, free)] = stepped(begin, step, lower, upper)
+            rows[np.ix_(judged, free)] = add_step(begin, step, lower, upper)
     return problem.score(rows, fit.starts, iterations=1).errors

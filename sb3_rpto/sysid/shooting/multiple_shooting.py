@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from sb3_rpto.dynamics.box import bounded_step, stepped
 from sb3_rpto.effects import Declared, Scales, Simulation
-from sb3_rpto.fitting.loss import Loss
+from sb3_rpto.fitting.gauss_newton import Trial, add_step, bounded_step, minimise, quadratic_fall
+from sb3_rpto.fitting.loss import CLIP, Loss
 from sb3_rpto.sysid.data.coordinates import straight
 from sb3_rpto.sysid.shooting.initial_states import moved
 from sb3_rpto.sysid.shooting.windows import Windows
@@ -22,10 +23,9 @@ RIDGE = 30.0
 WIDE, NARROW = 1.0, 0.01
 #: Shares of a start's step that are tried.
 SHARES = (1.0, 0.2)
-#: Changes of the damping that are tried, in their turn: the first alone where its step does as promised.
+#: Changes of the damping that are tried, in their turn: the first alone where its step does as expected; and its range.
 LADDER = ((0.1,), (1.0, 10.0, 100.0), (1e4, 1e6))
-#: Share of the promised fall of the cost that is enough to take a step without looking further.
-KEPT = 0.5
+DAMPINGS = (1e-6, 1e6)
 #: Fits to measured data far from the noise end when the cost falls by less than this share: what is missing makes it.
 CRUDE = 0.01
 #: All windows' errors below so many units of the noise, for exact data 1e-7 of what a position varies by, are met.
@@ -215,28 +215,28 @@ class Problem:
 
     # --- fits ---------------------------------------------------------------------------------------------------
 
-    def reduce(self, r: np.ndarray, jt: np.ndarray, jx: np.ndarray, starts: np.ndarray, loss: Loss) -> _Reduced:
+    def reduce(self, r: np.ndarray, jt: np.ndarray, jx: np.ndarray, starts: np.ndarray, loss: Loss) -> Reduced:
         """Weighted normal equations of each window with its start eliminated (Schur complement)."""
-        weight = 1 / np.sqrt(1 + (r / loss.clip) ** 2)
+        weight, hold = loss.weights(r), start_weight(loss)
         wt = jt * weight[:, :, None]
         normal, gradient = np.einsum("wrf,wrg->wfg", wt, jt), np.einsum("wrf,wr->wf", wt, r)
         gain, move = np.zeros((len(r), jx.shape[2], jt.shape[2])), np.zeros((len(r), jx.shape[2]))
         fall = np.zeros(len(r))
         if jx.shape[2]:
             wx = jx * weight[:, :, None]
-            hxx = np.einsum("wrx,wry->wxy", wx, jx) + loss.hold * np.eye(jx.shape[2])
+            hxx = np.einsum("wrx,wry->wxy", wx, jx) + hold * np.eye(jx.shape[2])
             hxt = np.einsum("wrx,wrf->wxf", wx, jt)
-            gx = np.einsum("wrx,wr->wx", wx, r) + loss.hold * starts[:, self.moving]
+            gx = np.einsum("wrx,wr->wx", wx, r) + hold * starts[:, self.moving]
             gain, move = np.linalg.solve(hxx, hxt), np.linalg.solve(hxx, gx[:, :, None])[:, :, 0]
             normal = normal - np.einsum("wxf,wxg->wfg", hxt, gain)
             gradient = gradient - np.einsum("wxf,wx->wf", hxt, move)
             fall = (gx * move).sum(-1)
-        return _Reduced(normal, gradient, gain, move, fall)
+        return Reduced(normal, gradient, gain, move, fall)
 
     def cost(self, r: np.ndarray, starts: np.ndarray, values: np.ndarray, loss: Loss) -> np.ndarray:
         """Robust cost of one or more candidates: r (..., W, R), starts (..., W, 2 nv), values (..., p)."""
         pull = np.where(self.known, 0.0, (values - self.null) / self.size / RIDGE) ** 2
-        return loss.energy(r, starts).sum(-1) + pull.sum(-1)
+        return window_costs(loss, r, starts).sum(-1) + pull.sum(-1)
 
     def fit(
         self,
@@ -257,116 +257,43 @@ class Problem:
         :param crude: the same of measured data far from the noise, where the typical window's falls no more either
         :return: never worse than where it began, if that is within the bounds
         """
-        values, damping, linear = values.copy(), 1e-3, None
-        r: np.ndarray | None = None
+        values = values.copy()
         values[free] = np.clip(values[free], self.lower[free], self.upper[free])
         starts = np.zeros((len(self.windows), 2 * self.simulation.model.nv)) if starts is None else starts.copy()
-        for _ in range(iterations):
-            r, jt, jx = self.linearise(values, starts, free, r)
-            loss = Loss.of(r)
-            now = float(self.cost(r, starts, values, loss))
-            reduced = self.reduce(r, jt, jx, starts, loss)
-            promised = self._promise(values, free, reduced, LADDER[0][0] * damping)
-            if promised < tolerance * now or self.errors(r).max() < MET:
-                linear = Linear(reduced.normal, reduced.gradient, free)
-                break
-            step = self._descend(values, starts, free, reduced, damping, loss, now, promised)
-            slow = loss.far and self._slow(loss, (r, starts), step, now, crude)
-            if step.cost < now:
-                values, starts, r = step.values, step.starts, step.residuals
-                damping = float(np.clip(step.damping, 1e-6, 1e6))
-            if slow or now - step.cost < tolerance * now:
-                break
-        assert r is not None  # there is an iteration
+        begin: Estimate = (values, starts, None)
+        descent = minimise(
+            lambda point: self.around(*point, free, tolerance, crude),
+            begin,
+            trust=1e-3,
+            ladder=LADDER if len(free) else LADDER[:1],
+            iterations=iterations,
+        )
+        values, starts, _ = descent.point
+        r = _residuals(descent.point)
+        around = descent.around
+        linear = (
+            Linear(around.reduced.normal, around.reduced.gradient, free) if isinstance(around, Neighbourhood) else None
+        )
         return Fit(values, starts, self.errors(r), float(self.cost(r, starts, values, Loss.of(r))), linear)
 
-    def _slow(self, loss: Loss, before: tuple[np.ndarray, np.ndarray], step: _Step, now: float, share: float) -> bool:
-        """Whether measured data are met better by less than a share after a step, as a whole and typically.
-
-        In kinks, which contacts make and exact data show, fits creep before they get on.
-        """
-        if self.exact or self.touching or now - step.cost > share * now:
-            return False
-        ratio = loss.energy(step.residuals, step.starts) / np.maximum(loss.energy(*before), 1e-300)
-        return bool(np.median(ratio) > 1 - share)
-
-    def _promise(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced, damping: float) -> float:
-        """How far the cost would fall with a step if it were quadratic."""
-        z = self._step(values, free, reduced, damping)[free] / self.size[free]
-        normal, gradient = self._normal(values, free, reduced)
-        return float(reduced.fall.sum() - 2 * gradient @ z - z @ normal @ z)
-
-    def _descend(
+    def around(
         self,
         values: np.ndarray,
         starts: np.ndarray,
+        r: np.ndarray | None,
         free: np.ndarray,
-        reduced: _Reduced,
-        damping: float,
-        loss: Loss,
-        now: float,
-        promised: float,
-    ) -> _Step:
-        """The best step of the first rung of dampings that lowers the cost; of the lowest rung, by what it promised."""
-        best, enough = None, now - KEPT * promised
-        for factors in LADDER if len(free) else LADDER[:1]:
-            step = self._try(values, starts, free, reduced, damping * np.array(factors), loss)
-            if best is None or step.cost < best.cost:
-                best = step
-            if best.cost < enough:
-                break
-            enough = now
-        assert best is not None  # the ladder has rungs
-        return best
+        tolerance: float = 1e-3,
+        crude: float = CRUDE,
+    ) -> Neighbourhood:
+        """The cost around an estimate; arguments are those of :meth:`fit`.
 
-    def _try(
-        self,
-        values: np.ndarray,
-        starts: np.ndarray,
-        free: np.ndarray,
-        reduced: _Reduced,
-        dampings: np.ndarray,
-        loss: Loss,
-    ) -> _Step:
-        """Simulate the steps of several dampings side by side, and take the best.
-
-        Each window takes what suits it of its start's own step: near an unstable pose a whole step may lead astray.
+        :param r: the residuals there, (W, R), where they are known
         """
-        count, tries = len(self.windows), len(dampings)
-        steps = np.stack([self._step(values, free, reduced, d) for d in dampings])
-        follow = np.einsum("wxf,tf->twx", reduced.gain, steps[:, free] / self.size[free])
-        moves = np.stack([share * (reduced.move + follow) for share in SHARES])
-        trial_starts = np.tile(starts, (len(SHARES), tries, 1, 1))
-        trial_starts[..., self.moving] -= moves
-        trial_values = stepped(values, steps, self.lower, self.upper)
-        r = self.residuals(
-            np.tile(np.repeat(trial_values, count, 0), (len(SHARES), 1)),
-            trial_starts.reshape(len(SHARES) * tries * count, -1),
-            np.tile(np.arange(count), len(SHARES) * tries),
-        ).reshape(len(SHARES), tries, count, -1)
-        share = np.argmin(loss.energy(r, trial_starts), axis=0), np.arange(tries)[:, None], np.arange(count)
-        costs = self.cost(r[share], trial_starts[share], trial_values, loss)
-        best = int(np.argmin(costs))
-        return _Step(
-            trial_values[best], trial_starts[share][best], r[share][best], float(costs[best]), float(dampings[best])
-        )
-
-    def _step(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced, damping: float) -> np.ndarray:
-        """A damped Gauss-Newton step within the bounds, (p,); what would leave them is held there."""
-        step = np.zeros(len(values))
-        if not len(free):
-            return step
-        normal, gradient = self._normal(values, free, reduced)
-        normal = normal + damping * np.diag(np.diag(normal) + 1e-3 * np.diag(normal).max() + 1e-12)
-        low, high = ((b[free] - values[free]) / self.size[free] for b in (self.lower, self.upper))
-        step[free] = bounded_step(normal, gradient, low, high) * self.size[free]
-        return np.clip(values + step, self.lower, self.upper) - values
-
-    def _normal(self, values: np.ndarray, free: np.ndarray, reduced: _Reduced) -> tuple[np.ndarray, np.ndarray]:
-        """The normal equations of all windows with the pull towards the null values, (f, f) and (f,)."""
-        pull = np.where(self.known[free], 0.0, 1 / RIDGE**2)
-        z = (values[free] - self.null[free]) / self.size[free]
-        return reduced.normal.sum(0) + np.diag(pull), reduced.gradient.sum(0) + pull * z
+        r, jt, jx = self.linearise(values, starts, free, r)
+        loss = Loss.of(r)
+        cost = float(self.cost(r, starts, values, loss))
+        reduced = self.reduce(r, jt, jx, starts, loss)
+        return Neighbourhood(self, (values, starts, r), free, loss, cost, reduced, tolerance, crude)
 
     def bounded_fall(self, linear: Linear, values: np.ndarray) -> float:
         """How far the cost would fall within the bounds of the free parameters if it were quadratic.
@@ -379,7 +306,7 @@ class Problem:
         damped = normal + 1e-6 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(free))
         low, high = ((b[free] - values[free]) / self.size[free] for b in (self.lower, self.upper))
         z = bounded_step(damped, gradient, np.minimum(low, 0.0), np.maximum(high, 0.0))
-        return float(-2 * gradient @ z - z @ normal @ z)
+        return quadratic_fall(normal, gradient, z)
 
     def linear(self, fit: Fit, free: np.ndarray) -> Linear:
         """The reduced normal equations at a fit, for screening, elimination and intervals."""
@@ -406,14 +333,14 @@ class Problem:
             trial = starts.copy()
             trial[:, self.moving] -= self.reduce(r, jt, jx, starts, loss).move
             now = self.residuals(rows, trial, np.arange(count))
-            before, after = loss.energy(r, starts), loss.energy(now, trial)
+            before, after = window_costs(loss, r, starts), window_costs(loss, now, trial)
             better = after < before
             starts = np.where(better[:, None], trial, starts)
             best = np.where(better[:, None], now, r)
             if np.minimum(before, after).sum() > (1 - STILL) * before.sum():
                 break
         best = self.residuals(rows, starts, np.arange(count)) if best is None else best
-        return Fit(values, starts, self.errors(best), float(Loss.of(best).energy(best, starts).sum()))
+        return Fit(values, starts, self.errors(best), float(window_costs(Loss.of(best), best, starts).sum()))
 
     def redrawn(self, fit: Fit, rng: np.random.Generator) -> Problem:
         """The same windows as the model itself would have been measured; starts that are samples get noise, too."""
@@ -450,21 +377,135 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class _Reduced:
-    normal: np.ndarray  # (W, f, f)
-    gradient: np.ndarray  # (W, f)
-    gain: np.ndarray  # (W, x, f), how the starts follow the parameters
-    move: np.ndarray  # (W, x), how the starts move by themselves
-    fall: np.ndarray  # (W,), of the energy by that
+class Reduced:
+    """The normal equations of each window, its start eliminated.
+
+    :param normal: (W, f, f)
+    :param gradient: (W, f)
+    :param gain: how the starts follow the parameters, (W, x, f)
+    :param move: how the starts move by themselves, (W, x)
+    :param fall: of the cost by that, (W,)
+    """
+
+    normal: np.ndarray
+    gradient: np.ndarray
+    gain: np.ndarray
+    move: np.ndarray
+    fall: np.ndarray
+
+
+#: Parameters (p,), starts (W, 2 nv) and, where they are known, residuals (W, R).
+Estimate = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 
 
 @dataclass(frozen=True)
-class _Step:
-    values: np.ndarray  # (p,)
-    starts: np.ndarray  # (W, 2 nv)
-    residuals: np.ndarray  # (W, R)
+class Neighbourhood:
+    """The cost around an estimate, see :class:`~sb3_rpto.fitting.gauss_newton.Linearisation`; the trust is a damping.
+
+    :param problem: windows
+    :param point: the estimate
+    :param free: indices of the free parameters, (f,)
+    :param loss: of the residuals there
+    :param cost: there
+    :param reduced: its normal equations
+    :param tolerance: see :meth:`Problem.fit`
+    :param crude: likewise
+    """
+
+    problem: Problem
+    point: Estimate
+    free: np.ndarray
+    loss: Loss
     cost: float
-    damping: float
+    reduced: Reduced
+    tolerance: float
+    crude: float
+
+    def expected_fall(self, trust: float) -> float:
+        """How far the cost would fall with a step of this damping if it were quadratic."""
+        z = self._step(trust)[self.free] / self.problem.size[self.free]
+        return float(self.reduced.fall.sum() + quadratic_fall(*self._normal, z))
+
+    def converged(self, fall: float) -> bool:
+        """Whether a step would gain less than the tolerance, or all windows are met exactly."""
+        return bool(fall < self.tolerance * self.cost or self.problem.errors(_residuals(self.point)).max() < MET)
+
+    def best_trial(self, trusts: np.ndarray) -> Trial[Estimate]:
+        """Simulate the steps of several dampings side by side, and take the best.
+
+        Each window takes what suits it of its start's own step: near an unstable pose a whole step may lead astray.
+        """
+        problem, (values, starts, _) = self.problem, self.point
+        count, tries = len(problem.windows), len(trusts)
+        steps = np.stack([self._step(d) for d in trusts])
+        follow = np.einsum("wxf,tf->twx", self.reduced.gain, steps[:, self.free] / problem.size[self.free])
+        moves = np.stack([share * (self.reduced.move + follow) for share in SHARES])
+        trial_starts = np.tile(starts, (len(SHARES), tries, 1, 1))
+        trial_starts[..., problem.moving] -= moves
+        trial_values = add_step(values, steps, problem.lower, problem.upper)
+        r = problem.residuals(
+            np.tile(np.repeat(trial_values, count, 0), (len(SHARES), 1)),
+            trial_starts.reshape(len(SHARES) * tries * count, -1),
+            np.tile(np.arange(count), len(SHARES) * tries),
+        ).reshape(len(SHARES), tries, count, -1)
+        costs = window_costs(self.loss, r, trial_starts)
+        share = np.argmin(costs, axis=0), np.arange(tries)[:, None], np.arange(count)
+        fall = self.cost - problem.cost(r[share], trial_starts[share], trial_values, self.loss)
+        best = int(np.argmax(fall))
+        point = trial_values[best], trial_starts[share][best], r[share][best]
+        return Trial(point, float(fall[best]), float(np.clip(trusts[best], *DAMPINGS)))
+
+    def is_last(self, trial: Trial[Estimate]) -> bool:
+        """Whether a step gains less than the tolerance, or measured data far from the noise are met little better.
+
+        These are met little better as a whole and typically. In kinks, which contacts make and exact data show, fits
+        creep before they get on.
+        """
+        if trial.fall < self.tolerance * self.cost:
+            return True
+        problem = self.problem
+        if not self.loss.model_error_dominates or problem.exact or problem.touching:
+            return False
+        if trial.fall > self.crude * self.cost:
+            return False
+        after, before = (window_costs(self.loss, _residuals(p), p[1]) for p in (trial.point, self.point))
+        return bool(np.median(after / np.maximum(before, 1e-300)) > 1 - self.crude)
+
+    def _step(self, damping: float) -> np.ndarray:
+        """A damped Gauss-Newton step within the bounds, (p,); what would leave them is held there."""
+        problem, free, (values, _, _) = self.problem, self.free, self.point
+        step = np.zeros(len(values))
+        if not len(free):
+            return step
+        normal, gradient = self._normal
+        normal = normal + damping * np.diag(np.diag(normal) + 1e-3 * np.diag(normal).max() + 1e-12)
+        low, high = ((b[free] - values[free]) / problem.size[free] for b in (problem.lower, problem.upper))
+        step[free] = bounded_step(normal, gradient, low, high) * problem.size[free]
+        return np.clip(values + step, problem.lower, problem.upper) - values
+
+    @cached_property
+    def _normal(self) -> tuple[np.ndarray, np.ndarray]:
+        """The normal equations of all windows with the pull towards the null values, (f, f) and (f,)."""
+        problem, free = self.problem, self.free
+        pull = np.where(problem.known[free], 0.0, 1 / RIDGE**2)
+        z = (self.point[0][free] - problem.null[free]) / problem.size[free]
+        return self.reduced.normal.sum(0) + np.diag(pull), self.reduced.gradient.sum(0) + pull * z
+
+
+def _residuals(estimate: Estimate) -> np.ndarray:
+    """Residuals (W, R) of an estimate around which the cost was linearised, or that a step led to."""
+    assert estimate[2] is not None
+    return estimate[2]
+
+
+def start_weight(loss: Loss) -> float:
+    """Weight of the starts: where the model errs by more than noise, they must not make up for it."""
+    return (loss.clip / CLIP) ** 2
+
+
+def window_costs(loss: Loss, r: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Robust sum of squares of each window with its start, (..., W), of residuals (..., W, R)."""
+    return np.asarray(loss.cost(r).sum(-1) + start_weight(loss) * (starts**2).sum(-1))
 
 
 # --- between steps ----------------------------------------------------------------------------------------------------

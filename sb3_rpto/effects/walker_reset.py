@@ -17,7 +17,7 @@ _UPRIGHT = 0.5  # of a floor's normal, its vertical part
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-class Stance:
+class WalkerReset:
     """Stands a walker whose body has changed as it stood before.
 
     Its lowest point at reset keeps its distance from the floor, and ``_healthy_z_range``, where the task has one, keeps
@@ -42,7 +42,7 @@ class Stance:
         self._gap, self._height = found
         self._healthy: tuple[float, float] | None = getattr(base, "_healthy_z_range", None)
 
-    def take(self, base: Any) -> None:
+    def apply(self, base: Any) -> None:
         """Stand the walker of ``base`` as it is now: its start height and healthy heights are set."""
         if self._joint is None:
             return
@@ -60,30 +60,30 @@ class StandingEnv(CorrectedEnv):
     """A gymnasium MuJoCo environment with effects, on its feet.
 
     As :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`, and its start height and healthy heights follow its body
-    (:class:`Stance`) from the next reset on.
+    (:class:`WalkerReset`) from the next reset on.
 
     :param env: as there
     :param effects: as there
-    :param before: as of :class:`Stance`
+    :param before: as of :class:`WalkerReset`
     :raises ValueError: as there
     """
 
     def __init__(self, env: gym.Env, effects: Sequence[Effect], before: tuple[float, float] | None = None) -> None:
-        self._stance = Stance(env.unwrapped, before)
+        self._walker_reset = WalkerReset(env.unwrapped, before)
         super().__init__(env, effects)
 
     def set_effects(self, effects: Sequence[Effect]) -> None:
         """As in :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`; the walker stands on its feet at the next reset."""
         super().set_effects(effects)
-        self._stance.take(self.unwrapped)
+        self._walker_reset.apply(self.unwrapped)
 
     def __getstate__(self) -> dict[str, Any]:
         """As in :class:`~sb3_rpto.effects.wrapper.CorrectedEnv`."""
-        return {**super().__getstate__(), "before": self._stance.before}
+        return {**super().__getstate__(), "before": self._walker_reset.before}
 
 
 def nominal_heights(model: mujoco.MjModel) -> tuple[float, float] | None:
-    """Of the reference pose, as :class:`Stance` keeps them: its lowest point over the floor, its body over that; m."""
+    """Of the reference pose in m: its lowest point over the floor, and its body over that (:class:`WalkerReset`)."""
     joint = _vertical(model)
     return None if joint is None else _heights(model, joint, model.qpos0)
 

@@ -21,13 +21,13 @@ def add(numbers: np.ndarray, amounts: np.ndarray) -> None:
     numbers[:] = np.maximum(numbers + amounts, 0.0)
 
 
-class World(ABC):
+class SimulationBatch(ABC):
     """``n`` simulations of one model, as arrays whose first axis is the simulation.
 
     State arrays are live: what the physics moves shows in them. ``force`` and ``friction`` are collected from the
     effects in every substep, then written at once.
 
-    :param model: the nominal model; its fields are never written through the world of a batch
+    :param model: the nominal model; its fields are never written through a :class:`MujocoBatch`
     :param n: number of simulations
     """
 
@@ -158,21 +158,21 @@ class World(ABC):
         """The (n, nbody, 3) live forces of xfrc_applied."""
 
 
-class BatchWorld(World):
+class MujocoBatch(SimulationBatch):
     """``n`` simulations on the threads of a :class:`mujoco.batch.Batch`; 0: one for each of :func:`cores`."""
 
     def __init__(self, model: mujoco.MjModel, n: int, nthread: int = 0) -> None:
         super().__init__(model, n)
-        self.batch = Batch(model, n, nthread or cores())
-        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
-        self.ctrl, self.time = self.batch.bind("ctrl"), self.batch.bind("time")
-        self.actuation = self.batch.bind("qfrc_actuator")
+        self.engine = Batch(model, n, nthread or cores())
+        self.qpos, self.qvel = self.engine.bind("qpos"), self.engine.bind("qvel")
+        self.ctrl, self.time = self.engine.bind("ctrl"), self.engine.bind("time")
+        self.actuation = self.engine.bind("qfrc_actuator")
 
     def _live(self, name: str) -> np.ndarray:
-        return self.batch.expand(name)
+        return self.engine.expand(name)
 
-    def settle_as(self, few: "BatchWorld", kind: np.ndarray) -> None:
-        """Take the fields of another world that has settled, and the constants that follow from them.
+    def settle_as(self, few: "MujocoBatch", kind: np.ndarray) -> None:
+        """Take the fields of another batch that has settled, and the constants that follow from them.
 
         :param few: of the same model
         :param kind: which of its simulations each one here is like, (n,)
@@ -181,34 +181,34 @@ class BatchWorld(World):
             self.field(name)[:] = few._live(name)[kind]
         for name in mujoco.MjModel._setconst_outputs:
             # Of both: what followed here from the numbers of a rollout before must go, too.
-            if any(world.batch.expanded(name) is not None for world in (few, self)):
+            if any(batch.engine.expanded(name) is not None for batch in (few, self)):
                 self._live(name)[:] = few._live(name)[kind]
         self._begin_to_act()
 
     def derive(self) -> None:
-        """As in :class:`World`; once for all simulations whose fields are alike, as many are in a fit."""
+        """As in :class:`SimulationBatch`; once for all simulations whose fields are alike, as many are in a fit."""
         written = [self._live(name).reshape(self.n, -1) for name in self._nominal if name in _DERIVING]
         if not written:
             return
         _, first, kind = np.unique(np.concatenate(written, axis=1), axis=0, return_index=True, return_inverse=True)
-        self.batch.set_const(np.sort(first))
+        self.engine.set_const(np.sort(first))
         for name in mujoco.MjModel._setconst_outputs:
-            if self.batch.expanded(name) is not None:
+            if self.engine.expanded(name) is not None:
                 live = self._live(name)
                 live[:] = live[first[kind.ravel()]]
 
     def evaluate(self) -> None:
-        """As in :class:`World`."""
-        self.batch.forward()
+        """As in :class:`SimulationBatch`."""
+        self.engine.forward()
 
     def _applied(self) -> np.ndarray:
-        return self.batch.bind("qfrc_applied")
+        return self.engine.bind("qfrc_applied")
 
     def _pulled(self) -> np.ndarray:
-        return np.asarray(self.batch.bind("xfrc_applied")[:, :, :3])
+        return np.asarray(self.engine.bind("xfrc_applied")[:, :, :3])
 
 
-class LiveWorld(World):
+class LiveSimulation(SimulationBatch):
     """The one simulation of an environment; writes go to its own model and data.
 
     :param data: the environment's data
@@ -217,9 +217,29 @@ class LiveWorld(World):
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         super().__init__(model, 1)
         self.data = data
-        self.qpos, self.qvel, self.ctrl = data.qpos[None], data.qvel[None], data.ctrl[None]
-        self.actuation = data.qfrc_actuator[None]
         self._numbers: dict[str, np.ndarray] = {}  # options that are plain numbers: written here, then to the model
+
+    # Views are taken when asked for: a copy of this has those of its own data.
+
+    @property
+    def qpos(self) -> np.ndarray:  # type: ignore[override]
+        """Positions, (1, nq), live."""
+        return np.asarray(self.data.qpos[None])
+
+    @property
+    def qvel(self) -> np.ndarray:  # type: ignore[override]
+        """Velocities, (1, nv), live."""
+        return np.asarray(self.data.qvel[None])
+
+    @property
+    def ctrl(self) -> np.ndarray:  # type: ignore[override]
+        """Commands, (1, nu), live."""
+        return np.asarray(self.data.ctrl[None])
+
+    @property
+    def actuation(self) -> np.ndarray:  # type: ignore[override]
+        """The actuators' generalised force at the last evaluate, (1, nv), live."""
+        return np.asarray(self.data.qfrc_actuator[None])
 
     @property
     def time(self) -> np.ndarray:  # type: ignore[override]
@@ -234,12 +254,12 @@ class LiveWorld(World):
         return values[None]
 
     def restore(self) -> None:
-        """As in :class:`World`."""
+        """As in :class:`SimulationBatch`."""
         super().restore()
         self._write_numbers()
 
     def settle(self) -> None:
-        """As in :class:`World`."""
+        """As in :class:`SimulationBatch`."""
         self._write_numbers()
         super().settle()
 
@@ -248,12 +268,12 @@ class LiveWorld(World):
             setattr(self.model.opt, name.removeprefix("opt."), value.item())
 
     def derive(self) -> None:
-        """As in :class:`World`."""
+        """As in :class:`SimulationBatch`."""
         # mj_setConst writes the data at the reference pose: a scratch copy keeps the environment where it is.
         mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
 
     def evaluate(self) -> None:
-        """As in :class:`World`."""
+        """As in :class:`SimulationBatch`."""
         mujoco.mj_forward(self.model, self.data)
 
     def _applied(self) -> np.ndarray:

@@ -10,6 +10,14 @@ import numpy as np
 NULL = 5e-8
 #: Parameters with less than this share of a direction's largest one do not belong to it.
 LOAD = 0.05
+#: A parameter that moves no residual by this share of the typical one, for a change by its scale, is not identified.
+INSENSITIVE = 1e-3
+
+
+def sensitive(jacobian: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+    """Which parameters move the residuals (m,) at all, by the derivatives (m, p); (p,), bool."""
+    size = np.sqrt((jacobian**2).sum(axis=0))
+    return np.asarray(size >= INSENSITIVE * max(float(np.sqrt((residuals**2).sum())), 1e-6))
 
 
 def null_directions(normal: np.ndarray, shown: np.ndarray) -> np.ndarray:
@@ -31,26 +39,22 @@ def null_directions(normal: np.ndarray, shown: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(directions)[0])
 
 
-def entangled(directions: np.ndarray) -> np.ndarray:
+def confounded_parameters(directions: np.ndarray) -> np.ndarray:
     """Parameters that have a share in one of the directions (p, k), (p,), bool."""
-    return np.asarray(_loaded(directions))
+    share = np.linalg.norm(directions, axis=1)
+    return np.asarray(share > LOAD * share.max(initial=0.0))
 
 
-def to_hold(directions: np.ndarray) -> np.ndarray:
-    """One parameter for each of the directions (p, k), such that with them held the others are determined, (p,), bool.
+def parameters_to_fix(directions: np.ndarray) -> np.ndarray:
+    """One parameter for each of the directions (p, k), such that with them fixed the others are determined, (p,), bool.
 
-    The later ones are held: a choice by the order of declaration stays the same from fit to fit.
+    The later ones are fixed: a choice by the order of declaration stays the same from fit to fit.
     """
-    held = np.zeros(len(directions), dtype=bool)
+    fixed = np.zeros(len(directions), dtype=bool)
     while directions.shape[1]:
-        last = np.flatnonzero(_loaded(directions))[-1]
-        held[last] = True
+        last = np.flatnonzero(confounded_parameters(directions))[-1]
+        fixed[last] = True
         # What remains of the space of directions while this parameter stays.
         _, _, rows = np.linalg.svd(directions[last : last + 1])
         directions = directions @ rows[1:].T
-    return held
-
-
-def _loaded(directions: np.ndarray) -> np.ndarray:
-    share = np.linalg.norm(directions, axis=1)
-    return share > LOAD * share.max(initial=0.0)
+    return fixed

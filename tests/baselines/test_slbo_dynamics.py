@@ -6,9 +6,9 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_rpto.dynamics import deterministic
+from sb3_rpto.baselines import slbo_dynamics
+from sb3_rpto.baselines.slbo_dynamics import FARTHEST, DeterministicDynamics, open_loop_loss
 from sb3_rpto.dynamics.base import Transitions
-from sb3_rpto.dynamics.deterministic import FARTHEST, DeterministicDynamics, open_loop_loss
 
 A = th.tensor([[0.9, 0.2], [-0.3, 1.1]], dtype=th.float64)
 B = th.tensor([[0.5], [-1.0]], dtype=th.float64)
@@ -112,7 +112,7 @@ def test_the_same_question_has_one_answer():
 
 def test_rows_that_go_on_from_each_other_are_followed_and_no_others(monkeypatch):
     data, seen = one_trajectory(), []
-    monkeypatch.setattr(deterministic, "open_loop_loss", lambda *given: seen.append(given) or open_loop_loss(*given))
+    monkeypatch.setattr(slbo_dynamics, "open_loop_loss", lambda *given: seen.append(given) or open_loop_loss(*given))
     model = make()
     model.fit(data, max_steps=3)
     model.fit(data.take(th.arange(0, 400, 2)), max_steps=3)
@@ -125,7 +125,7 @@ def test_rows_that_go_on_from_each_other_are_followed_and_no_others(monkeypatch)
 
 def test_interleaved_rows_of_several_environments_are_followed(monkeypatch):
     data, seen = one_trajectory(), []
-    monkeypatch.setattr(deterministic, "open_loop_loss", lambda *given: seen.append(given) or open_loop_loss(*given))
+    monkeypatch.setattr(slbo_dynamics, "open_loop_loss", lambda *given: seen.append(given) or open_loop_loss(*given))
     order = th.arange(400).reshape(2, 200).T.reshape(-1)  # two halves, row by row
     make().fit(data.take(order), max_steps=3)
     _, observations, _, following, continues, _ = seen[0]
@@ -137,7 +137,7 @@ def test_an_ended_episode_is_not_followed(monkeypatch):
     data = one_trajectory(10)
     data.observations[5] += 1.0  # a reset
     seen = []
-    monkeypatch.setattr(deterministic, "open_loop_loss", lambda *given: seen.append(given) or open_loop_loss(*given))
+    monkeypatch.setattr(slbo_dynamics, "open_loop_loss", lambda *given: seen.append(given) or open_loop_loss(*given))
     make(batch_size=200).fit(data, max_steps=1)
     _, observations, _, following, continues, _ = seen[0]
     assert th.equal(continues[0], (following[0] == observations[1]).all(dim=1))

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from sb3_rpto.dynamics.identifiable import entangled, null_directions, to_hold
+from sb3_rpto.fitting.identifiability import (
+    confounded_parameters,
+    null_directions,
+    parameters_to_fix,
+    sensitive,
+)
 
 rng = np.random.default_rng(0)
 A, B, C = rng.standard_normal((3, 40))
@@ -29,8 +34,8 @@ def test_directions_are_found(columns, shown, together, held):
     slopes = np.stack(columns, axis=1)
     directions = null_directions(slopes.T @ slopes, shown)
     np.testing.assert_allclose(slopes @ directions, 0, atol=1e-6)
-    assert np.flatnonzero(entangled(directions)).tolist() == together
-    assert np.flatnonzero(to_hold(directions)).tolist() == held
+    assert np.flatnonzero(confounded_parameters(directions)).tolist() == together
+    assert np.flatnonzero(parameters_to_fix(directions)).tolist() == held
 
 
 def test_who_shares_in_what_is_not_told_does_not_hang_on_the_solver(monkeypatch):
@@ -49,6 +54,13 @@ def test_who_shares_in_what_is_not_told_does_not_hang_on_the_solver(monkeypatch)
         monkeypatch.setattr(np.linalg, "eigh", turned)
         directions = null_directions(normal, shown)
         np.testing.assert_allclose(directions.T @ directions, np.eye(2), atol=1e-12)
-        shares.append((entangled(directions).tolist(), to_hold(directions).tolist()))
+        shares.append((confounded_parameters(directions).tolist(), parameters_to_fix(directions).tolist()))
     assert shares == [shares[0]] * 4
     np.testing.assert_allclose(slopes @ directions, 0, atol=1e-6)
+
+
+def test_a_parameter_is_sensitive_where_it_moves_the_residuals_by_a_share_of_their_size():
+    residuals = np.full(4, 10.0)
+    jacobian = np.outer(np.ones(4), [0.0, 0.009, 0.011, 5.0])
+    assert sensitive(jacobian, residuals).tolist() == [False, False, True, True]
+    assert sensitive(np.outer(np.ones(4), [0.0, 1e-8]), np.zeros(4)).tolist() == [False, True]
