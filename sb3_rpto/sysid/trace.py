@@ -15,7 +15,7 @@ from sb3_rpto.effects.model import file_of
 from sb3_rpto.effects.units import units_at
 from sb3_rpto.ranges import SEED, THREADS, check, whole
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding, grouped
+from sb3_rpto.sysid.findings import Finding, FindingKind, grouped
 from sb3_rpto.sysid.hypotheses.column_errors import misread
 from sb3_rpto.sysid.hypotheses.conclude import Searched, conclude
 from sb3_rpto.sysid.hypotheses.undeclared_mass import undeclared_mass
@@ -210,11 +210,11 @@ def _of_the_search(searched: Searched) -> list[Finding]:
             f"judged with steps of {step:g} ms: longer ones err by a good part of what is left (dry friction and "
             "contacts are kinks); the corrected simulator errs less with a smaller timestep, too"
         )
-        found.append(Finding("time step", "model", message))
+        found.append(Finding(FindingKind.TIME_STEP, "model", message))
     if selector.select is None:
         count = len(selector.train.windows)
         message = f"selected on {count} windows of the training runs by cross-validation over blocks"
-        found.append(Finding("split", "training runs", message))
+        found.append(Finding(FindingKind.SPLIT, "training runs", message))
     return found
 
 

@@ -10,6 +10,7 @@ from simulated import PENDULUM, WITH_WHEEL, compiled, recorded
 from sb3_rpto.effects import LIBRARY, Simulation
 from sb3_rpto.effects.forces import Spring, TorqueOffset
 from sb3_rpto.sysid import Measurements, trace
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.report.diagnostics import (
     above_noise,
     brief_delays,
@@ -39,7 +40,7 @@ def test_a_model_that_few_windows_pass_is_told_where_the_test_runs_deny_it(
     after = replace(ERROR, low=np.array([low, 0.9e-3]))
     errors = [after, replace(after, horizon="whole run")]
     found = above_noise(errors, [FLOOR], ratio, length=0.8)
-    assert [f.kind for f in found] == ["few windows"] * told
+    assert [f.kind for f in found] == [FindingKind.FEW_WINDOWS] * told
     assert above_noise(errors, [FLOOR], ratio, length=1.1) == []  # over so little the starts decide
 
 
@@ -118,7 +119,7 @@ def test_transitions_of_finer_steps_than_the_models_are_told(step: float, told: 
     own = Simulation(model, [], 1)
     problem = Problem(own, cut(model, data, noise_levels(data), 0.16, 20), [])
     found = finer_steps(problem, own.null, np.empty(0, dtype=int), data, 0.16)
-    assert [f.kind for f in found] == ["time step"] * told
+    assert [f.kind for f in found] == [FindingKind.TIME_STEP] * told
     assert not told or "with steps of 5 ms in place of 20 ms" in found[0].message
     assert finer_steps(problem, own.null, np.empty(0, dtype=int), replace(data, exact=False), 0.16) == []
 
@@ -173,5 +174,5 @@ def test_friction_that_creeps_as_mujocos_does_by_default_is_told(constraint: str
     data = Measurements.from_tables(tables)
     report = trace(coarse, data, ["hinge.damping"], known=known, candidates=[], threads=1)
     assert (report.verdict == "complete") == bool(constraint)
-    told = [f.where for f in report.findings if f.kind == "soft friction"]
+    told = [f.where for f in report.findings if f.kind == FindingKind.SOFT_FRICTION]
     assert told == ([] if constraint else ["coulomb_friction(hinge)"])

@@ -12,6 +12,7 @@ from simulated import PENDULUM, briefly, compiled, recorded
 
 from sb3_rpto.effects.forces import Spring
 from sb3_rpto.sysid import Measurements, Report
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.report.html import render
 
 #: of six runs, in rad
@@ -86,7 +87,7 @@ def test_the_report_says_them() -> None:
     assert f"{run} {report.zeros.offsets[0, 0]:+.3g}" in str(report)
     assert "differ from run to run" in render(report)
     assert report.to_json()["zeros"]["offsets"]["hinge"][run] == pytest.approx(report.zeros.offsets[0, 0])
-    assert "run zeros" in {f.kind for f in report.findings}
+    assert FindingKind.RUN_ZEROS in {f.kind for f in report.findings}
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import pytest
 
 from sb3_rpto.sysid import Measurements
 from sb3_rpto.sysid.data.encoder_unwrapping import settle_turns
+from sb3_rpto.sysid.findings import FindingKind
 
 TURN = 2 * np.pi
 ANGLE = 0.4 * np.sin(np.linspace(0, 6, 200)) - 0.1
@@ -29,13 +30,13 @@ def test_a_wrapped_angle_comes_to_where_the_model_has_it(joint: str, start: int)
     angle = ANGLE[start:]
     data, found = settle_turns(arm(joint), recorded(np.mod(angle, TURN)))
     np.testing.assert_allclose(data.episodes[0].qpos[:, 0], angle, atol=1e-12)
-    assert {f.kind for f in found} <= {"whole turns"}
+    assert {f.kind for f in found} <= {FindingKind.WHOLE_TURNS}
 
 
 def test_an_angle_outside_its_limits_is_shifted_though_it_never_wrapped() -> None:
     data, found = settle_turns(arm('range="-1.5 1.5"'), recorded(ANGLE + TURN))
     np.testing.assert_allclose(data.episodes[0].qpos[:, 0], ANGLE, atol=1e-12)
-    assert [f.kind for f in found] == ["whole turns"]
+    assert [f.kind for f in found] == [FindingKind.WHOLE_TURNS]
 
 
 @pytest.mark.parametrize("joint", ["", 'stiffness="0.5"'], ids=["free", "wound-up spring"])
@@ -47,7 +48,7 @@ def test_turns_that_may_be_meant_stay(joint: str) -> None:
 
 def test_what_no_turn_accounts_for_is_said_and_kept() -> None:
     _, found = settle_turns(arm('range="-1.5 1.5"'), recorded(ANGLE + 1.4))
-    assert "outside limits" in [f.kind for f in found]
+    assert FindingKind.OUTSIDE_LIMITS in [f.kind for f in found]
 
 
 def test_degrees_are_refused_where_the_joints_limits_tell_them() -> None:
@@ -64,7 +65,7 @@ def test_a_slide_in_other_units_is_refused_where_its_limits_tell_them(factor: fl
         settle_turns(arm('type="slide" range="-1.5 1.5"'), recorded(factor * ANGLE))
     settle_turns(arm('type="slide"'), recorded(factor * ANGLE))  # it may be long
     _, found = settle_turns(arm('type="slide" range="-0.05 0.05"'), recorded(ANGLE))  # or the limits are wrong
-    assert [f.kind for f in found] == ["outside limits"]
+    assert [f.kind for f in found] == [FindingKind.OUTSIDE_LIMITS]
 
 
 def test_a_joint_without_a_name_has_whole_turns_too() -> None:
@@ -74,7 +75,7 @@ def test_a_joint_without_a_name_has_whole_turns_too() -> None:
     column = {"time": np.arange(len(ANGLE)) * 0.01, "qpos.joint0": ANGLE + TURN}
     data, found = settle_turns(model, Measurements.from_tables({"run": column}))
     np.testing.assert_allclose(data.episodes[0].qpos[:, 0], ANGLE, atol=1e-12)
-    assert [f.kind for f in found] == ["whole turns"]
+    assert [f.kind for f in found] == [FindingKind.WHOLE_TURNS]
 
 
 def servo(gear: float = 1.0) -> mujoco.MjModel:
@@ -95,7 +96,7 @@ def test_what_a_servo_holds_comes_to_its_command(centre: float, gear: float) -> 
     encoder = np.mod(angle + np.pi, TURN) - np.pi
     data, found = settle_turns(servo(gear), commanded(encoder, gear * (angle + 0.05)))
     np.testing.assert_allclose(data.episodes[0].qpos[:, 0], angle, atol=1e-12)
-    assert [f.kind for f in found] == ["whole turns"]
+    assert [f.kind for f in found] == [FindingKind.WHOLE_TURNS]
 
 
 def test_a_servos_limits_are_its_own_where_another_actuator_takes_two_commands() -> None:

@@ -13,6 +13,7 @@ import pytest
 from sb3_rpto.effects.effect import LIBRARY
 from sb3_rpto.sysid import Finding, Report
 from sb3_rpto.sysid.data.measurements import Noise
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.report import descriptions, figures, residual_plots
 from sb3_rpto.sysid.report.html import render
 from sb3_rpto.sysid.report.report import Candidate
@@ -143,7 +144,7 @@ def test_names_of_users_cannot_break_the_page(report: Report, monkeypatch: pytes
     other = replace(
         report,
         candidates=[Candidate(evil, "dropped", evil, 1.0, [evil])],
-        findings=[Finding(evil, evil, evil)],
+        findings=[Finding(FindingKind.GAP, evil, evil)],
         runs={"train": [evil], "select": [], "test": [evil]},
         noise={"hinge": 1e-3},
         effects=[replace(report.effects[0], alike=[evil])],

@@ -9,6 +9,7 @@ import pytest
 
 from sb3_rpto.sysid import Measurements
 from sb3_rpto.sysid.data.sample_clock import settle_clock
+from sb3_rpto.sysid.findings import FindingKind
 
 
 def recorded(stamps: float, samples: float, noise: float = 3e-4, slow: float = 1.0, lost: int = 0) -> Measurements:
@@ -30,8 +31,8 @@ def recorded(stamps: float, samples: float, noise: float = 3e-4, slow: float = 1
 def test_stamps_that_jitter_give_way_to_an_even_clock(lost: int, simulated: bool) -> None:
     there = recorded(stamps=3e-4, samples=0.0, lost=lost)
     data, findings = settle_clock(replace(there, simulated=simulated))
-    assert [f.kind for f in findings] == ["even clock"] * 2
-    assert not [f for f in data.findings if f.kind == "jitter"]
+    assert [f.kind for f in findings] == [FindingKind.EVEN_CLOCK] * 2
+    assert not [f for f in data.findings if f.kind == FindingKind.JITTER]
     for e in data.episodes:
         ticks = np.round((e.time - e.time[0]) / 0.01)
         np.testing.assert_allclose(e.time, 0.01 * ticks + e.time[0], atol=1.2e-4)

@@ -11,7 +11,7 @@ from sb3_rpto.effects.actuation import command_limits, drivers, servo_of
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 #: A slide that moves over so many times what its limits let it is in other units, by whatever zero.
@@ -33,7 +33,7 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
     :param data: recordings; not changed
     :return: the recordings, and what was found
     """
-    wrapped = {finding.where for finding in data.findings if finding.kind == "wrapped angle"}
+    wrapped = {finding.where for finding in data.findings if finding.kind == FindingKind.WRAPPED_ANGLE}
     joints = object_names(model, "joint")
     found, episodes = [], []
     for episode in data.episodes:
@@ -54,13 +54,13 @@ def settle_turns(model: mujoco.MjModel, data: Measurements) -> tuple[Measurement
                 if turns:
                     qpos[:, column] -= 2 * np.pi * turns
                     message = f"{turns:+d} turn(s) from the joint's {why}; taken off"
-                    found.append(Finding.of_run("whole turns", run, place, message))
+                    found.append(Finding.of_run(FindingKind.WHOLE_TURNS, run, place, message))
             over = float(np.maximum(low - qpos[:, column], qpos[:, column] - high).max())
             if over > BEYOND and not (data.exact or data.simulated):
                 message = (
                     f"up to {over:.3g} beyond the joint's limits in the model (rad or m): another zero, or other units"
                 )
-                found.append(Finding.of_run("outside limits", run, place, message))
+                found.append(Finding.of_run(FindingKind.OUTSIDE_LIMITS, run, place, message))
         episodes.append(replace(episode, qpos=qpos))
     return replace(data, episodes=episodes), found
 

@@ -30,7 +30,7 @@ from sb3_rpto.sysid.data import signal_quality
 from sb3_rpto.sysid.data.columns import Columns, columns_of, joint_of
 from sb3_rpto.sysid.data.measurements import Measurements, Noise
 from sb3_rpto.sysid.data.recording import Episode
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.shooting.initial_states import turning
 
 MIN_TRANSITIONS = 2
@@ -84,7 +84,7 @@ def from_replay(
     findings = []
     if broken:
         message = f"{broken} time(s) a transition does not begin where one before it ended; cut there"
-        findings.append(Finding("gap", ALL, message))
+        findings.append(Finding(FindingKind.GAP, ALL, message))
     return build(runs, env, exact and noise is None, findings, noise)
 
 
@@ -171,7 +171,7 @@ def build(
         )
     if len(kept) < len(runs):
         message = f"{len(runs) - len(kept)} of {len(runs)} with fewer than {MIN_TRANSITIONS} transitions; dropped"
-        findings.append(Finding("short", ALL, message))
+        findings.append(Finding(FindingKind.SHORT, ALL, message))
     for run in kept:
         if not (np.isfinite(run.observations).all() and np.isfinite(run.actions).all()):
             raise ValueError(f"episode {run.name} of {env_name(env)} has NaN or infinite values; remove it")
@@ -211,7 +211,7 @@ def build(
             if flags[:, i].any() and not flags[:, i].all():
                 unusable = "which are not compared" if prefix == "qpos" else "where no prediction begins"
                 message = f"unknown in {(~flags[:, i]).sum()} of {len(flags)} samples, {unusable}"
-                findings.append(Finding("clipped", f"{ALL}, {prefix}.{name}", message))
+                findings.append(Finding(FindingKind.CLIPPED, f"{ALL}, {prefix}.{name}", message))
     columns = replace(columns, missing=repairs.missing)
     return Measurements(
         episodes,
@@ -276,7 +276,7 @@ def _commands(actions: np.ndarray, env: gym.Env, findings: list[Finding]) -> np.
         else:
             # It may be the very effect that is looked for, and have a state or a random stream of its own.
             message = f"{type(layer).__name__} is taken as part of the machine: commands are what it receives"
-            findings.append(Finding("wrapper", ALL, message))
+            findings.append(Finding(FindingKind.WRAPPER, ALL, message))
     if actions.shape != (len(actions), model.nu):
         raise ValueError(
             f"{env_name(env)}: actions have shape (n, {actions.shape[1:]}), the model {model.nu} actuators; "
@@ -347,14 +347,14 @@ class _Repairs:
         found = []
         for name in self.unobserved:
             done = "integrated from its velocity" if name in self.integrated else "known only roughly"
-            found.append(Finding("unobserved", f"{ALL}, qpos.{name}", f"not observed; {done}, not compared"))
+            found.append(Finding(FindingKind.UNOBSERVED, f"{ALL}, qpos.{name}", f"not observed; {done}, not compared"))
         for name in self.missing:
             message = "not observed; estimated from the position by a cubic Savitzky-Golay filter"
-            found.append(Finding("missing velocity", f"{ALL}, qvel.{name}", message))
+            found.append(Finding(FindingKind.MISSING_VELOCITY, f"{ALL}, qvel.{name}", message))
         for name, count in self.turns.items():
             if count:
                 message = f"{count} turn(s) that the observation lost; recovered by means of the velocity"
-                found.append(Finding("wrapped angle", f"{ALL}, qpos.{name}", message))
+                found.append(Finding(FindingKind.WRAPPED_ANGLE, f"{ALL}, qpos.{name}", message))
         return found
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from sb3_rpto.sysid.data import signal_quality
 from sb3_rpto.sysid.data.columns import Columns, joint_of, read_columns
 from sb3_rpto.sysid.data.recording import PARTS, Episode, Table, check_clocks, read_run, repair, runs_of
-from sb3_rpto.sysid.data.signal_quality import Finding
 from sb3_rpto.sysid.data.text_tables import read_text, renamed
+from sb3_rpto.sysid.findings import Finding, FindingKind, grouped
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -96,7 +96,7 @@ class Measurements:
 
     def __str__(self) -> str:
         """That line, and what was found, each kind once."""
-        return "\n".join([repr(self), *(f"  {finding}" for finding in signal_quality.grouped(self.findings))])
+        return "\n".join([repr(self), *(f"  {finding}" for finding in grouped(self.findings))])
 
     @classmethod
     def from_csv(cls, paths: Paths, rename: Mapping[str, str] | None = None) -> "Measurements":
@@ -210,7 +210,7 @@ class Measurements:
                 content += (run.time - run.time[0]).round(9).tobytes()
                 if content in seen:
                     message = f"the same samples as episode {seen[content]!r}; only that one is kept"
-                    findings.append(Finding.of_run("duplicate", name, "", message))
+                    findings.append(Finding.of_run(FindingKind.DUPLICATE, name, "", message))
                     continue
                 seen[content] = name
                 episodes += repair(run, columns, findings)
@@ -335,7 +335,9 @@ class Measurements:
                 if name not in part.values():
                     if name == "train":
                         raise ValueError("no episode has 'train' in the column 'split'; name at least one")
-                    findings.append(Finding("split", "all episodes", f"the column 'split' names no {name} episode"))
+                    findings.append(
+                        Finding(FindingKind.SPLIT, "all episodes", f"the column 'split' names no {name} episode")
+                    )
         else:
             runs = sorted({e.run for e in self.episodes})
             n = len(runs)
@@ -343,7 +345,11 @@ class Measurements:
             n_select = min(round(fractions[1] * n), n - n_test)
             if n_test == 0:
                 findings.append(
-                    Finding("split", "all episodes", "there is but one run: no test data, errors cannot be held out")
+                    Finding(
+                        FindingKind.SPLIT,
+                        "all episodes",
+                        "there is but one run: no test data, errors cannot be held out",
+                    )
                 )
             if n - n_test - n_select < 3:
                 n_select = 0
@@ -351,7 +357,7 @@ class Measurements:
                     f"{n - n_test} run(s) remain for training: none is set apart to select on, "
                     "use blocks of the training runs"
                 )
-                findings.append(Finding("split", "all episodes", message))
+                findings.append(Finding(FindingKind.SPLIT, "all episodes", message))
             lengths = {r: sum(len(e.time) for e in self.episodes if e.run == r) for r in runs}
             order = _drawn(lengths, n_test + n_select, seed)
             part = {

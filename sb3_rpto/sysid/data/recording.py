@@ -7,7 +7,7 @@ import numpy as np
 
 from sb3_rpto.sysid.data import signal_quality
 from sb3_rpto.sysid.data.columns import Columns, joint_of
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 
 Table = Mapping[str, np.ndarray]
 PARTS = ("train", "select", "test")
@@ -216,13 +216,13 @@ def repair(run: Episode, columns: Columns, findings: list[Finding]) -> list[Epis
         message = (
             f"{len(slices) - 1} gap(s) in time, the longest {longest:.4g} s; split there into {len(slices)} episodes"
         )
-        findings.append(Finding.of_run("gap", run.name, "", message))
+        findings.append(Finding.of_run(FindingKind.GAP, run.name, "", message))
     pieces = []
     for i, rows in enumerate(slices):
         name = run.name if len(slices) == 1 else f"{run.name}/{i}"
         if rows.stop - rows.start < signal_quality.MIN_ROWS:
             message = f"{rows.stop - rows.start} row(s) between gaps are too few to use; set aside"
-            findings.append(Finding.of_run("short", name, "", message))
+            findings.append(Finding.of_run(FindingKind.SHORT, name, "", message))
             continue
         pieces.append(replace(run.part_of(rows, after_gap=i > 0), name=name))
         _channels(pieces[-1], columns, findings)
@@ -245,16 +245,16 @@ class _Tell:
     def __init__(self, episode: Episode, findings: list[Finding]) -> None:
         self._name, self._findings = episode.name, findings
 
-    def __call__(self, kind: str, message: str, column: str = "time") -> None:
+    def __call__(self, kind: FindingKind, message: str, column: str = "time") -> None:
         self._findings.append(Finding.of_run(kind, self._name, column, message))
 
     def slope(self, slope: float | None, column: str) -> None:
         """Of measured velocities against the positions' change, where it is not about 1."""
         if slope is None or signal_quality.SLOPE[0] <= slope <= signal_quality.SLOPE[1]:
             return
-        kind, cause = "velocity slope", "check units and filters"
+        kind, cause = FindingKind.VELOCITY_SLOPE, "check units and filters"
         if slope < 0:
-            kind, cause = "flipped velocity", "its sign is flipped"
+            kind, cause = FindingKind.FLIPPED_VELOCITY, "its sign is flipped"
         elif any(
             signal_quality.SLOPE[0] <= slope / factor <= signal_quality.SLOPE[1] for factor in (DEGREES, 1 / DEGREES)
         ):
@@ -275,20 +275,20 @@ def _look_at_samples(episode: Episode, columns: Columns, tell: _Tell) -> None:
     spread = signal_quality.jitter(episode.time)
     if spread > signal_quality.JITTER:
         tell(
-            "jitter",
+            FindingKind.JITTER,
             f"steps vary by {spread:.0%} around their median of {np.median(np.diff(episode.time)):.4g} s; kept as they "
             "are: where the logger, not the robot, was late, give the times at which the samples were taken",
         )
     elif late := signal_quality.missing(episode.time):
         tell(
-            "missing rows",
+            FindingKind.MISSING_ROWS,
             f"{late} step(s) are longer than the others, and no gaps: the command of a row that is missing is not "
             "known, and the one before is held instead. Keep such rows with their commands, and interpolate the rest",
         )
     rows = signal_quality.held(episode.qpos)
     if rows is not None:
         tell(
-            "held samples",
+            FindingKind.HELD_SAMPLES,
             f"positions are fresh in every {rows}. row alone, and repeated between: keep those rows, as held ones look "
             "like late sensors and commands",
             "qpos",
@@ -298,7 +298,7 @@ def _look_at_samples(episode: Episode, columns: Columns, tell: _Tell) -> None:
         rows = signal_quality.held(episode.qpos[:, i : i + 1])
         if rows is not None:
             tell(
-                "held samples",
+                FindingKind.HELD_SAMPLES,
                 f"it is fresh in every {rows}. row alone, and repeated between: interpolate it between those rows, or "
                 "keep them alone, as what is held looks like a late sensor",
                 f"qpos.{name}",
@@ -318,16 +318,20 @@ def _repair_orientations(episode: Episode, columns: Columns, tell: _Tell) -> Non
         if off > ROUNDED:
             episode.qpos[:, first : first + 4] /= norms[:, None]
             if off > WORTH_SAYING:
-                tell("quaternion norm", f"off 1 by up to {off:.2g}; divided by it", f"qpos.{joint}")
+                tell(FindingKind.QUATERNION_NORM, f"off 1 by up to {off:.2g}; divided by it", f"qpos.{joint}")
         flips = signal_quality.align_quaternions(episode.qpos[:, first : first + 4])
         if flips:
-            tell("quaternion sign", f"{flips} change(s) between q and -q, one orientation; aligned", f"qpos.{joint}")
+            tell(
+                FindingKind.QUATERNION_SIGN,
+                f"{flips} change(s) between q and -q, one orientation; aligned",
+                f"qpos.{joint}",
+            )
         turn = [i for i, name in enumerate(columns.qvel) if joint_of(name) == joint and name not in columns.missing]
         measured, oriented = episode.qvel[:, turn[-3:]], episode.qpos[:, first : first + 4]
         other = signal_quality.turning_convention(episode.time, oriented, measured) if turn else None
         if other is not None:
             message = f"the numbers fit {other}; kept as they are: give w, x, y, z, and velocities in the body's frame"
-            tell("other convention", message, f"qpos.{joint}")
+            tell(FindingKind.OTHER_CONVENTION, message, f"qpos.{joint}")
         elif turn:
             tell.slope(signal_quality.turning_slope(episode.time, oriented, measured), f"qvel.{joint}")
 
@@ -344,10 +348,10 @@ def _repair_positions(episode: Episode, columns: Columns, tell: _Tell) -> None:
             change = np.diff(episode.time) * 0.5 * (velocity[1:] + velocity[:-1])
         episode.qpos[:, i], jumps, fast = signal_quality.unwrap(episode.qpos[:, i], change)
         if jumps:
-            tell("wrapped angle", f"{jumps} jump(s) of about one turn; unwrapped", f"qpos.{name}")
+            tell(FindingKind.WRAPPED_ANGLE, f"{jumps} jump(s) of about one turn; unwrapped", f"qpos.{name}")
         if fast:
             message = "many steps are of about half a turn, so whole turns may be lost: sample faster, or give qvel"
-            tell("fast angle", message, f"qpos.{name}")
+            tell(FindingKind.FAST_ANGLE, message, f"qpos.{name}")
         _bridge_glitches(episode, i, tell, f"qpos.{name}")
         leaps = np.abs(np.diff(episode.qpos[:, i])[signal_quality.jumps(episode.time, episode.qpos[:, i])])
         if len(leaps):
@@ -357,7 +361,7 @@ def _repair_positions(episode: Episode, columns: Columns, tell: _Tell) -> None:
                 f"{len(leaps)} step(s) of {sizes} from a sample to the next, far faster than all others; kept: unwrap "
                 "the encoder at its own period, or split the run where it was moved by hand or set anew"
             )
-            tell("jump", message, f"qpos.{name}")
+            tell(FindingKind.JUMP, message, f"qpos.{name}")
 
 
 def _bridge_glitches(episode: Episode, column: int, tell: _Tell, where: str) -> None:
@@ -384,7 +388,7 @@ def _bridge_glitches(episode: Episode, column: int, tell: _Tell, where: str) -> 
         if few
         else "kept, as they are many: where they are no readings, interpolate them, or drop them with their commands"
     )
-    tell("glitch", message, where)
+    tell(FindingKind.GLITCH, message, where)
     if not few:
         return
     position[wrong] = np.interp(episode.time[wrong], episode.time[~wrong], position[~wrong])
@@ -405,7 +409,7 @@ def _complete_velocities(episode: Episode, columns: Columns, tell: _Tell) -> Non
                 rates = signal_quality.angular_velocity(episode.time, turning[joint_of(name)])
                 episode.qvel[:, i] = rates[:, int(name[-1]) % 3]  # .0 to .2 of a ball joint, .3 to .5 of a free one
             tell(
-                "missing velocity",
+                FindingKind.MISSING_VELOCITY,
                 "not measured; estimated from the position by a cubic Savitzky-Golay filter",
                 f"qvel.{name}",
             )
@@ -414,7 +418,7 @@ def _complete_velocities(episode: Episode, columns: Columns, tell: _Tell) -> Non
         if step is not None:
             levels = len(np.unique(velocity))
             tell(
-                "quantised velocity",
+                FindingKind.QUANTISED_VELOCITY,
                 f"{levels} distinct values in {len(velocity)} samples, smallest step {step:.4g}",
                 f"qvel.{name}",
             )

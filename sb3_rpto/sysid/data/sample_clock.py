@@ -9,7 +9,7 @@ import numpy as np
 from sb3_rpto.sysid.data import signal_quality
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 
 #: A clock that jitters by less than this fraction of its interval is even.
 SLIGHT = 0.005
@@ -45,8 +45,8 @@ def settle_clock(data: Measurements) -> tuple[Measurements, list[Finding]]:
         "noise variance that they have on the stamps, where they move fast; traced with even times"
     )
     episodes = [replace(e, time=jittered[i]) if i in jittered else e for i, e in enumerate(data.episodes)]
-    kept = [finding for finding in data.findings if finding.kind != "jitter"]
-    findings = [Finding.of_run("even clock", data.episodes[i].name, "time", message) for i in jittered]
+    kept = [finding for finding in data.findings if finding.kind != FindingKind.JITTER]
+    findings = [Finding.of_run(FindingKind.EVEN_CLOCK, data.episodes[i].name, "time", message) for i in jittered]
     return replace(data, episodes=episodes, findings=kept), findings
 
 

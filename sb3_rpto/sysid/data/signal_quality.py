@@ -1,10 +1,6 @@
 """What can be wrong with one recorded run: pure functions on arrays, each of which repairs or reports one thing."""
 
-import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Self
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -35,94 +31,6 @@ ANSWER, SEVERAL = 0.1, 0.01
 """What moves within so many seconds of an unusual command may answer it; at most this share of samples is bridged."""
 WINDOW = 9
 """Samples of the filter that differentiates positions."""
-
-
-#: A number in a message, not one that is part of a name.
-_NUMBER = re.compile(r"(?<![\w.,'\"+-])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])(?!\.\d)")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something about the data that a reader of the results must know.
-
-    :param kind: one of a few fixed words, e.g. ``"gap"`` or ``"wrapped angle"``
-    :param where: the episode and, where there is one, the column
-    :param message: what was found and what was done about it, in plain language
-    :param runs: names of the runs or episodes that it is about; none where it is about no single ones
-    """
-
-    kind: str
-    where: str
-    message: str
-    runs: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        return f"{self.kind} in {self.where}: {self.message}"
-
-    @classmethod
-    def of_run(cls, kind: str, run: str, place: str, message: str) -> Self:
-        """One about a single run.
-
-        :param place: the column there; may be empty
-        """
-        return cls(kind, f"{run}, {place}" if place else run, message, (run,))
-
-    @property
-    def place(self) -> str:
-        """Where it is, without the run."""
-        return self.where.removeprefix(self.runs[0]).removeprefix(", ") if len(self.runs) == 1 else self.where
-
-
-def listed(names: Sequence[str], most: int = 6) -> str:
-    """Names in a sentence, the first few where there are many."""
-    shown, more = [*names[:most]], len(names) - most
-    if more > 0:
-        return f"{', '.join(shown)} and {more} more"
-    return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
-
-
-def grouped(findings: Iterable[Finding]) -> list[Finding]:
-    """Findings that say the same of several runs or places as one, in their order.
-
-    Of several runs numbers may differ: a message then tells the least and the largest of each.
-
-    :param findings: such as were grouped before are left as they are
-    """
-    of_runs: dict[tuple[str, ...], list[Finding]] = {}
-    for finding in findings:
-        said = _NUMBER.sub("#", finding.message) if len(finding.runs) == 1 else finding.message
-        of_runs.setdefault((finding.kind, finding.place, said), []).append(finding)
-    of_places: dict[tuple[str, str, tuple[str, ...]], list[tuple[str, Finding]]] = {}
-    for alike in of_runs.values():
-        first = alike[0]
-        message = _ranges([finding.message for finding in alike])
-        runs = tuple(dict.fromkeys(run for finding in alike for run in finding.runs))
-        of_places.setdefault((first.kind, message, runs), []).append((first.place, first))
-    found = []
-    for (kind, message, runs), places in of_places.items():
-        first = places[0][1]
-        if len(places) == 1 and runs == first.runs:
-            found.append(first)
-            continue
-        where = listed([place for place, _ in places if place])
-        if len(runs) == 1:
-            where = f"{runs[0]}, {where}"
-        elif len(first.runs) == 1:
-            where = f"{where} of {listed(runs)}" if where else listed(runs)
-        found.append(Finding(kind, where, message, runs))
-    return found
-
-
-def _ranges(messages: Sequence[str]) -> str:
-    """Messages that differ in numbers alone as one."""
-    columns = zip(*(_NUMBER.findall(message) for message in messages))
-    ends = iter([(min(column, key=float), max(column, key=float)) for column in columns])
-
-    def between(number: re.Match[str]) -> str:
-        low, high = next(ends)
-        return low if float(low) == float(high) else f"{low} to {high}"
-
-    return _NUMBER.sub(between, messages[0]) if len(messages) > 1 else messages[0]
 
 
 def split_at_gaps(time: np.ndarray) -> list[slice]:

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from sb3_rpto.effects import LIBRARY, Declared, Effect
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.hypotheses.encoder_offsets import Zeros, homed, settled, zeros_by_run
 from sb3_rpto.sysid.problem.data_origin import may_be_exact, met_exactly, origin
 from sb3_rpto.sysid.problem.prepare import Progress, SetUp
@@ -24,18 +24,18 @@ SOFTER = 0.5
 #: Kinds that brake a joint in every substep and have a held form.
 TWINS = ("coulomb_friction", "soft_friction", "viscous_friction", "asymmetric_damping", "quadratic_drag")
 SOFT = Finding(
-    "soft friction",
+    FindingKind.SOFT_FRICTION,
     "fitted runs",
     "dry friction gives way near rest, as MuJoCo's frictionloss alone does and a machine's hardly",
 )
 HELD = Finding(
-    "held forces",
+    FindingKind.HELD_FORCES,
     "fitted runs",
     "forces stay what they are at the beginning of a step of the environment until its end, as where a wrapper writes "
     "them, and no machine's do",
 )
 UNLIKE = Finding(
-    "split",
+    FindingKind.SPLIT,
     "fitted runs",
     "the runs set apart to select on do not show what is missing in the others: blocks of all of them take turns",
 )
@@ -130,7 +130,7 @@ def conclude(
                 f"from the model's integrator in steps of {step:g} ms, as a simulator's are: it meets them better than "
                 "the continuous motion does"
             )
-            set_up.findings.append(Finding("simulated", "fitted runs", message))
+            set_up.findings.append(Finding(FindingKind.SIMULATED, "fitted runs", message))
     again = _of_own_steps(set_up, found, declared, threads)
     if again is not None:
         simulated = True
@@ -141,7 +141,7 @@ def conclude(
         if _explains(then):
             set_up, found = exact, then
             message = "from the model's own steps in time, without noise, as shows with what was found: searched again"
-            set_up.findings.append(Finding("simulated", "fitted runs", message))
+            set_up.findings.append(Finding(FindingKind.SIMULATED, "fitted runs", message))
     first = found
     zeros = zeros_by_run(set_up, found, _explains(found), say, seed)
     if zeros is not None:
@@ -220,4 +220,4 @@ def _of_own_steps(set_up: SetUp, found: Found, declared: Sequence[str], threads:
     if kind == "machine":
         return None
     message = "from the model's own steps in time, as shows with what was found first; searched again in such steps"
-    return Finding("simulated", "fitted runs", message)
+    return Finding(FindingKind.SIMULATED, "fitted runs", message)

@@ -13,7 +13,7 @@ from scipy.stats import t as student
 from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.effects.sensors import readers
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.problem.prepare import SELECT, TRAIN, Progress, SetUp
 from sb3_rpto.sysid.report import descriptions
 from sb3_rpto.sysid.selection.adequacy import adequacy
@@ -62,7 +62,7 @@ class Zeros:
             "fitted runs; those of other runs are not known, and predictions err by that much more there. Home the "
             "machine at a stop or a mark"
         )
-        return Finding("run zeros", "fitted runs, encoders", message)
+        return Finding(FindingKind.RUN_ZEROS, "fitted runs, encoders", message)
 
     def to_json(self) -> dict[str, Any]:
         """Offsets by joint and run, and the evidence for them."""

@@ -7,17 +7,20 @@ import numpy as np
 from sb3_rpto.effects import Declared, Scales, Simulation
 from sb3_rpto.effects.library import candidates
 from sb3_rpto.effects.names import object_id
+from sb3_rpto.sysid.findings import FindingKind, Hint
 from sb3_rpto.sysid.hypotheses.column_errors import CLEARLY, FITTED, ITERATIONS, WINDOWS
 from sb3_rpto.sysid.problem.prepare import SetUp
-from sb3_rpto.sysid.problem.unsupported_elements import Hint
 from sb3_rpto.sysid.selection.pipeline import Found
 from sb3_rpto.sysid.shooting.multiple_shooting import Problem
 from sb3_rpto.sysid.shooting.windows import cut
 
 #: A body is looked at with these changes of each; those that promise most are fitted.
 LOOKS = (-0.3, 0.4)
-#: The effects that change them, and what to declare then.
-DECLARE = {"mass_scale": "mass", "inertia_scale": "inertia"}
+#: The effects that change them, what to declare then, and what says so.
+DECLARE = {
+    "mass_scale": ("mass", FindingKind.UNDECLARED_MASS),
+    "inertia_scale": ("inertia", FindingKind.UNDECLARED_INERTIA),
+}
 
 
 def undeclared_mass(found: Found, set_up: SetUp) -> list[Hint]:
@@ -51,10 +54,10 @@ def undeclared_mass(found: Found, set_up: SetUp) -> list[Hint]:
     if best is None:
         return []
     scale, times = best
-    what = DECLARE[scale.kind]
+    what, kind = DECLARE[scale.kind]
     message = (
         f"with {times:.3g} times its {what} the model errs by {share:.0%} of what it does: declare {scale.on}.{what}, "
         "and trace again"
     )
     where = frozenset({object_id(set_up.nominal, "body", scale.on)})
-    return [Hint(f"undeclared {what}", scale.on, message, bodies=where, left=share)]
+    return [Hint(kind, scale.on, message, bodies=where, left=share)]

@@ -22,7 +22,7 @@ from sb3_rpto.envs.step_fidelity import odd_step
 from sb3_rpto.sysid.data.encoder_unwrapping import settle_turns
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.sample_clock import settle_clock
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.problem.contacts import OFTEN, contact_changes
 from sb3_rpto.sysid.problem.data_model_consistency import carried_weights, check_against, soft_friction, soft_ties
 from sb3_rpto.sysid.problem.data_origin import idle, origin
@@ -138,7 +138,7 @@ def _own_step(model: Any) -> list[Finding]:
         f"{found}. The MJCF alone is compared with the data: what step() adds is named as missing where the data show "
         "it, and is there twice in a corrected environment. Make it part of the MJCF or an effect, or leave it out"
     )
-    return [Finding("own step", "step() of the environment", message)]
+    return [Finding(FindingKind.OWN_STEP, "step() of the environment", message)]
 
 
 def prepare(
@@ -176,14 +176,14 @@ def prepare(
             replace(d, unobserved=unobserved) for d in (data, train, select, test, fitted)
         )
         message = "never changes, so nothing tells how finely it is measured: it is not compared with predictions"
-        findings += [Finding("at rest", f"fitted runs, qpos.{name}", message) for name in resting]
+        findings += [Finding(FindingKind.AT_REST, f"fitted runs, qpos.{name}", message) for name in resting]
     sigma = noise_levels(fitted)
     changes = contact_changes(compiled, fitted, sigma)
     touching = changes > OFTEN
     length = _horizon(fitted, touching) if horizon is None else float(horizon)
     if touching and horizon is None:
         message = f"{changes:.1f} a second come or go; windows of {length:.2g} s, as errors about a touch-down grow"
-        findings.append(Finding("contacts", "fitted runs", message))
+        findings.append(Finding(FindingKind.CONTACTS, "fitted runs", message))
     # What was told need not be found out.
     seems = "told" if data.simulated else origin(roomy, fitted, declared, sigma, length, threads, known)
     if seems in ("simulated", "exact"):
@@ -195,7 +195,7 @@ def prepare(
         sigma = noise_levels(fitted)
         noise = "without noise" if data.exact else "with noise"
         message = f"from the model's own steps in time, {noise}: they meet them better than the continuous motion does"
-        findings.append(Finding("simulated", "fitted runs", message))
+        findings.append(Finding(FindingKind.SIMULATED, "fitted runs", message))
     touching &= not data.exact  # those are met, or fits begin anew until they are
     train, select, test, fitted = (replace(d, touching=touching) for d in (train, select, test, fitted))
     nominal = discretised(roomy, fitted, fine=True)
@@ -210,7 +210,7 @@ def prepare(
     effects = [*there, *_candidates(nominal, there, kinds, data.exact)]
     nowhere = [kind for kind in kinds or () if not LIBRARY[kind].places(nominal)]
     message = "named among the candidates, but nothing in this model can have it: it is not looked for"
-    findings += [Finding("no place", kind, message) for kind in dict.fromkeys(nowhere)]
+    findings += [Finding(FindingKind.NO_PLACE, kind, message) for kind in dict.fromkeys(nowhere)]
     for effect in effects:
         if not type(effect).__module__.startswith("sb3_rpto."):
             try_out(nominal, effect)

@@ -12,10 +12,9 @@ from sb3_rpto.effects import Declared, Effect, Scales, Simulation
 from sb3_rpto.effects.actuation import servo_of
 from sb3_rpto.effects.units import joint_of
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding, listed
+from sb3_rpto.sysid.findings import Finding, FindingKind, Hint, listed
 from sb3_rpto.sysid.hypotheses.column_errors import CLEARLY
 from sb3_rpto.sysid.problem.prepare import SHORTER, SetUp
-from sb3_rpto.sysid.problem.unsupported_elements import Hint
 from sb3_rpto.sysid.report import descriptions
 from sb3_rpto.sysid.selection.adequacy import BEYOND, TOLERANCE, Adequacy
 from sb3_rpto.sysid.selection.stepwise_selection import Selector
@@ -77,7 +76,7 @@ def missed(
         "that it was fitted to: a test run differs (a moved sensor, another load), or moves as none of those did; the "
         "verdict is about those"
     )
-    return [Finding("missed", listed(runs), message, tuple(runs))]
+    return [Finding(FindingKind.MISSED, listed(runs), message, tuple(runs))]
 
 
 def _from_fitted_starts(
@@ -107,7 +106,7 @@ def above_noise(after: list[HorizonError], floor: list[HorizonError], ratio: flo
         f"R is {ratio:.2f}, and in {clear[0].horizon:g} s the test runs err clearly more than noise leaves: so few "
         "windows cannot rule out that something small is missing, or that what is named stands in for it; record more"
     )
-    return [Finding("few windows", "test runs", message)]
+    return [Finding(FindingKind.FEW_WINDOWS, "test runs", message)]
 
 
 def vague_noise(after: Adequacy, data: Measurements) -> list[Finding]:
@@ -123,7 +122,7 @@ def vague_noise(after: Adequacy, data: Measurements) -> list[Finding]:
         "passes for noise, as after commands that change every few of them, and what is missing may hide below it; "
         "sample faster, or hold commands for more samples"
     )
-    return [Finding("vague noise", "fitted runs", message)]
+    return [Finding(FindingKind.VAGUE_NOISE, "fitted runs", message)]
 
 
 def strays(selector: Selector, values: np.ndarray, set_up: SetUp, after: Adequacy, seed: int) -> list[Finding]:
@@ -152,7 +151,7 @@ def strays(selector: Selector, values: np.ndarray, set_up: SetUp, after: Adequac
             )
             if after.denied_by_strays:
                 message += "; such windows alone deny that the model accounts for the data: see what happens there"
-            kind, where = "stray windows", "fitted runs"
+            kind, where = FindingKind.STRAY_WINDOWS, "fitted runs"
             found.append(Finding.of_run(kind, run, "", message) if run else Finding(kind, where, message))
     return found
 
@@ -171,7 +170,7 @@ def undetermined(problem: Problem, values: np.ndarray, intervals: np.ndarray) ->
                 f"{value:.4g} {descriptions.interval(low, high)}: these data do not tell it; move so that it matters, "
                 f"do not {'declare it, or declare' if is_number else 'give it, or give'} fewer that act alike"
             )
-            found.append(Finding("undetermined", where, message))
+            found.append(Finding(FindingKind.UNDETERMINED, where, message))
     return found
 
 
@@ -198,7 +197,7 @@ def at_bounds(problem: Problem, values: np.ndarray, named: Sequence[int]) -> lis
         else:
             where = f"{effect.label}, {parameter.name}"
             message += "the machine may lie beyond, or it stands in for something else"
-        found.append(Finding("at its bound", where, message))
+        found.append(Finding(FindingKind.AT_ITS_BOUND, where, message))
     return found
 
 
@@ -241,7 +240,7 @@ def soft_instead(problem: Problem, values: np.ndarray, named: Sequence[int]) -> 
     )
     model = problem.simulation.model
     bodies = frozenset(int(model.dof_bodyid[e.dof]) for e in firm)
-    return [Hint("soft friction", ", ".join(e.label for e in firm), message, bodies=bodies, left=share)]
+    return [Hint(FindingKind.SOFT_FRICTION, ", ".join(e.label for e in firm), message, bodies=bodies, left=share)]
 
 
 def own_steps(
@@ -275,7 +274,7 @@ def own_steps(
         f"astray in {horizon:g} s at {observed(data)[worst]}, where the noise is {noise[worst]:.2g}; the errors "
         'after are of finer ones: integrator="RK4" or a shorter timestep in the MJCF\'s <option> keeps them'
     )
-    return [Finding("own steps", "corrected simulator", message)]
+    return [Finding(FindingKind.OWN_STEPS, "corrected simulator", message)]
 
 
 def finer_steps(
@@ -305,7 +304,7 @@ def finer_steps(
         f"errs by {finer_error / error:.0%} of what it does: the target moves more finely than the model does, as a "
         "machine or another simulator; shorten the timestep in the MJCF's <option>, and raise frame_skip in proportion"
     )
-    return [Finding("time step", "the model", message)]
+    return [Finding(FindingKind.TIME_STEP, "the model", message)]
 
 
 def no_nearer(before: Sequence[HorizonError], after: Sequence[HorizonError]) -> list[Finding]:
@@ -319,7 +318,7 @@ def no_nearer(before: Sequence[HorizonError], after: Sequence[HorizonError]) -> 
         f"predicted worse with what is listed (worst for {b.joints[worst]}, {b.horizon:g} s ahead: {b.rmse[worst]:.3g} "
         f"before, {a.rmse[worst]:.3g} after): it stands in for something else; do not use the corrected simulator"
     )
-    return [Finding("no nearer", "test runs", message)]
+    return [Finding(FindingKind.NO_NEARER, "test runs", message)]
 
 
 def encoder_zeros(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Finding]:
@@ -342,7 +341,7 @@ def encoder_zeros(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Findin
             f"{'m' if model.jnt_type[joint] == SLIDE else 'rad'} look like this, too, with nothing wrong with the "
             "torque; check the zeros"
         )
-        found.append(Finding("encoder zero", effect.label, message))
+        found.append(Finding(FindingKind.ENCODER_ZERO, effect.label, message))
     return found
 
 
@@ -358,7 +357,7 @@ def tied_sensors(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Finding
         "numbers beside them lie outside of their intervals; check the tie"
     )
     return [
-        Finding("tied sensor", effect.label, message)
+        Finding(FindingKind.TIED_SENSOR, effect.label, message)
         for effect in named
         if effect.overrides("observe") and joint_of(effect, model) in tied
     ]
@@ -370,7 +369,7 @@ def idle_start(late: Sequence[Effect]) -> list[Finding]:
     :param late: effects that are so
     """
     message = "the runs begin as if zeros had been sent before, and so do episodes of the corrected simulator"
-    return [Finding("idle start", ", ".join(e.label for e in late), message)] if late else []
+    return [Finding(FindingKind.IDLE_START, ", ".join(e.label for e in late), message)] if late else []
 
 
 def brief_delays(named: Sequence[Effect], step: float) -> list[Finding]:
@@ -386,7 +385,7 @@ def brief_delays(named: Sequence[Effect], step: float) -> list[Finding]:
                 f"{1e3 * delay:.2g} ms are {delay / step:.1%} of the {1e3 * step:.3g} ms between two samples: time "
                 f"stamps that are late by as much look like this, and a simulator that steps {2e3 * delay:.2g} ms"
             )
-            found.append(Finding("brief delay", effect.label, message))
+            found.append(Finding(FindingKind.BRIEF_DELAY, effect.label, message))
     return found
 
 
@@ -396,7 +395,7 @@ def too_short(errors: list[HorizonError], data: Measurements) -> list[Finding]:
         return []
     length = 1e3 * max((float(np.ptp(e.time)) for e in data.episodes), default=0.0)
     message = f"no error on unseen runs: the longest stretch of theirs has {length:.3g} ms; set longer runs apart"
-    return [Finding("split", "test runs", message)]
+    return [Finding(FindingKind.SPLIT, "test runs", message)]
 
 
 def unstable(problem: Problem, before: np.ndarray, after: np.ndarray) -> list[Finding]:
@@ -409,5 +408,5 @@ def unstable(problem: Problem, before: np.ndarray, after: np.ndarray) -> list[Fi
         count = problem.unstable(values)
         if count:
             message = f"in {count} of {len(problem.windows)} the {which} model became unstable; {remedy}"
-            found.append(Finding("unstable", "fitted windows", message))
+            found.append(Finding(FindingKind.UNSTABLE, "fitted windows", message))
     return found

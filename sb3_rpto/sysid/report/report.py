@@ -15,7 +15,7 @@ from sb3_rpto.effects.corrected_model_io import carried_by, check_free, correcte
 from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.files import json_text, plain
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding
 from sb3_rpto.sysid.hypotheses.encoder_offsets import Zeros, zeros_of
 from sb3_rpto.sysid.problem.inverse_dynamics import ForceResidual
 from sb3_rpto.sysid.report import descriptions
