@@ -43,7 +43,8 @@ from sb3_rpto.sysid.report.diagnostics import (
     unstable,
     vague_noise,
 )
-from sb3_rpto.sysid.report.report import Candidate, Report, StandIn, Traced
+from sb3_rpto.sysid.report.report import Report
+from sb3_rpto.sysid.report.results import Candidate, StandIn, Traced
 from sb3_rpto.sysid.selection.adequacy import SETTLED
 from sb3_rpto.sysid.selection.confidence_intervals import FINAL, refit
 from sb3_rpto.sysid.selection.pipeline import Found, find, worth_a_look

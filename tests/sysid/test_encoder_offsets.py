@@ -13,7 +13,6 @@ from simulated import PENDULUM, briefly, compiled, recorded
 from sb3_rpto.effects.forces import Spring
 from sb3_rpto.sysid import Measurements, Report
 from sb3_rpto.sysid.findings import FindingKind
-from sb3_rpto.sysid.report.html import render
 
 #: of six runs, in rad
 ZEROS = np.array([0.03, -0.02, 0.0, -0.04, 0.05, -0.01])
@@ -85,7 +84,7 @@ def test_the_report_says_them() -> None:
     report = traced(0.0, 1.0)
     run = report.zeros.runs[0]
     assert f"{run} {report.zeros.offsets[0, 0]:+.3g}" in str(report)
-    assert "differ from run to run" in render(report)
+    assert "differ from run to run" in report.html()
     assert report.to_json()["zeros"]["offsets"]["hinge"][run] == pytest.approx(report.zeros.offsets[0, 0])
     assert FindingKind.RUN_ZEROS in {f.kind for f in report.findings}
 
