@@ -83,7 +83,7 @@ def test_what_all_runs_have_beyond_chance_is_a_bias_of_the_sensor() -> None:
 def test_the_report_says_them() -> None:
     report = traced(0.0, 1.0)
     run = report.zeros.runs[0]
-    assert f"{run} {report.zeros.offsets[0, 0]:+.3g}" in str(report)
+    assert f"{run} {report.zeros.offsets[0, 0]:+.3g}" in " ".join(str(report).split())
     assert "differ from run to run" in report.html()
     assert report.to_json()["zeros"]["offsets"]["hinge"][run] == pytest.approx(report.zeros.offsets[0, 0])
     assert FindingKind.RUN_ZEROS in {f.kind for f in report.findings}

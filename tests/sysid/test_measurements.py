@@ -16,7 +16,8 @@ from benchmarks.tracing.planting import generate
 from sb3_rpto.sysid import Measurements
 from sb3_rpto.sysid.data import signal_quality
 from sb3_rpto.sysid.data.columns import columns_of, read_columns
-from sb3_rpto.sysid.data.signal_quality import SLOPE, quantum, smoothed_velocity, split_at_gaps, unwrap, velocity_slope
+from sb3_rpto.sysid.data.settings import DATA
+from sb3_rpto.sysid.data.signal_quality import quantum, smoothed_velocity, split_at_gaps, unwrap, velocity_slope
 from sb3_rpto.sysid.findings import Finding, FindingKind, grouped
 
 MEASURED = Path(__file__).parents[3] / "shared" / "measured"
@@ -751,7 +752,7 @@ def test_wrong_velocities_of_noisy_motion_are_all_found(factor):
         for q, v in zip(e.qpos.T, e.qvel.T):
             slope = velocity_slope(e.time, q, factor * v)
             assert slope == pytest.approx(factor, rel=0.1)
-            assert not SLOPE[0] <= slope <= SLOPE[1]
+            assert not DATA.slope[0] <= slope <= DATA.slope[1]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3, 1.0, 1.5])
@@ -892,7 +893,7 @@ def test_held_samples_are_told_and_coarse_encoders_are_not() -> None:
         (np.round(np.sin(3 * time), 2), None),
         (0.01 * time // 1e-4, None),
     ):
-        assert signal_quality.held(position[:, None]) == found
+        assert signal_quality.rows_per_reading(position[:, None]) == found
     table = {"time": time, "qpos.hinge": held, "ctrl.motor": np.cos(time)}
     assert FindingKind.HELD_SAMPLES in kinds(Measurements.from_tables({"a": table}))
     mixed = Measurements.from_tables({"a": {**table, "qpos.elbow": motion}})  # one sensor is slower than the other

@@ -12,7 +12,7 @@ import pytest
 
 from sb3_rpto.effects.effect import LIBRARY
 from sb3_rpto.sysid import Finding, Report
-from sb3_rpto.sysid.data.measurements import Noise
+from sb3_rpto.sysid.data.recording import Noise
 from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.report import descriptions, figures
 from sb3_rpto.sysid.report.results import Candidate

@@ -15,10 +15,10 @@ from sb3_rpto.effects.actuation import FILTERS
 from sb3_rpto.effects.names import near, object_id, object_names
 from sb3_rpto.effects.simulation import prepare
 from sb3_rpto.effects.world import BatchWorld
-from sb3_rpto.sysid.data.angle_units import check_degrees, large_angles
 from sb3_rpto.sysid.data.columns import columns_of, joint_of
-from sb3_rpto.sysid.data.inverse_dynamics_terms import actuation, inverse, through, window_of
+from sb3_rpto.sysid.data.inverse_dynamics_terms import actuator_forces, filter_length, filtered_force, required_forces
 from sb3_rpto.sysid.data.measurements import Measurements
+from sb3_rpto.sysid.data.repairs import check_degrees, large_angles
 from sb3_rpto.sysid.data.signal_quality import smoothed_velocity
 from sb3_rpto.sysid.findings import Finding, FindingKind, Hint
 from sb3_rpto.sysid.problem.unsupported_elements import mocap_bodies, moved_by_mocap, of_actuator
@@ -382,27 +382,27 @@ def _forces(model: mujoco.MjModel, data: Measurements) -> Iterator[_Force]:
             model = world.batch.get_model(0)
         time = episode.time[rows]
         step = float(np.median(np.diff(time)))
-        window = window_of(step, data.exact)
+        window = filter_length(step, data.exact)
         qpos, qvel = episode.qpos[rows][:, order["qpos"]], episode.qvel[rows][:, order["qvel"]]
         qacc = smoothed_velocity(time, qvel, window)
         if not data.exact:
             size = min(window, n - (n + 1) % 2)
             qpos, qvel = (savgol_filter(array, size, 3, axis=0) for array in (qpos, qvel))
-        needed, free = inverse(model, qpos, qvel, qacc)
+        needed, free = required_forces(model, qpos, qvel, qacc)
         ctrl = episode.ctrl[rows][:, order["ctrl"]]
-        idle = actuation(model, time, qpos, qvel, np.zeros_like(ctrl))
-        told = actuation(model, time, qpos, qvel, ctrl) - idle
+        idle = actuator_forces(model, time, qpos, qvel, np.zeros_like(ctrl))
+        told = actuator_forces(model, time, qpos, qvel, ctrl) - idle
         usable = free & episode.usable[rows] & episode.enabled[rows].all(axis=1)
         clear = binary_erosion(usable, np.ones(window), border_value=1)
         for j in np.flatnonzero(model.jnt_type >= _SLIDE).tolist():
             dof = model.jnt_dofadr[j]
             if np.any(told[:, dof]):
-                given = through(time, told[:, dof], window)
+                given = filtered_force(time, told[:, dof], window)
                 yield _Force(episode.run, _label(model, j), (needed - idle)[:, dof], given, clear)
             name = own.qvel[dof]
             if name in data.columns.qfrc:
                 measured = episode.qfrc[rows][:, data.columns.qfrc.index(name)]
-                yield _Force(episode.run, f"qfrc.{name}", needed[:, dof], through(time, measured, window), clear)
+                yield _Force(episode.run, f"qfrc.{name}", needed[:, dof], filtered_force(time, measured, window), clear)
 
 
 def _label(model: mujoco.MjModel, joint: int) -> str:

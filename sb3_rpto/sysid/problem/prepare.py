@@ -19,9 +19,8 @@ from sb3_rpto.effects.model import load_model
 from sb3_rpto.effects.names import near
 from sb3_rpto.effects.validate_effect import try_out
 from sb3_rpto.envs.step_fidelity import odd_step
-from sb3_rpto.sysid.data.encoder_unwrapping import settle_turns
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.data.sample_clock import settle_clock
+from sb3_rpto.sysid.data.repairs import remove_whole_turns, use_even_clock
 from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.problem.contacts import OFTEN, contact_changes
 from sb3_rpto.sysid.problem.data_model_consistency import carried_weights, check_against, soft_friction, soft_ties
@@ -161,8 +160,8 @@ def prepare(
     """
     spec, compiled = load_model(model)
     data = replace(data, simulated=data.simulated or simulated)
-    data, turned = settle_turns(compiled, data)
-    data, clock = settle_clock(data)
+    data, turned = remove_whole_turns(compiled, data)
+    data, clock = use_even_clock(data)
     findings = [*data.findings, *turned, *clock, *check_against(compiled, data), *_own_step(model)]
     given(compiled, declared, known)  # what is wrong there is said before the work
     roomy = with_room(spec, compiled, data)

@@ -83,20 +83,29 @@ class Picture:
     caption: str
 
 
+def require() -> None:
+    """Fail early where matplotlib is absent.
+
+    :raises ImportError: it names the extra to install
+    """
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            "the figures of a report need matplotlib: pip install -e '.[tracing]' in the checkout"
+        ) from error
+
+
 def draw(rows: int, columns: int, paint: Callable[[np.ndarray], None], height: float = 2.5) -> str:
     """An SVG as a data URI, the same bytes for the same figure.
 
     :param paint: draws on axes of shape (rows, columns)
     :param height: of a row in inches
-    :raises ImportError: matplotlib is absent; it names the extra to install
+    :raises ImportError: see :func:`require`
     """
-    try:
-        import matplotlib
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError(
-            "the figures of a report need matplotlib: pip install -e '.[tracing]' in the checkout"
-        ) from error
+    require()
+    import matplotlib
+    from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")
