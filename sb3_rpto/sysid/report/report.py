@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 
 from sb3_rpto.effects import Declared
 from sb3_rpto.effects.corrected_model_io import carried_by, check_free, corrected_files, write_files
+from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.files import json_text, plain
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.hypotheses.encoder_offsets import Zeros, zeros_of
@@ -21,9 +23,6 @@ from sb3_rpto.sysid.report.results import Results, Traced
 from sb3_rpto.sysid.report.sections import sections_of
 from sb3_rpto.sysid.shooting.prediction_errors import HorizonError
 from sb3_rpto.version import __version__
-
-if TYPE_CHECKING:
-    import gymnasium as gym
 
 #: Of ``report.json``.
 FORMAT = 1
@@ -38,8 +37,6 @@ class Report(Results):
 
         Effects come on top of those that it has: one that was corrected already is corrected twice.
         """
-        from sb3_rpto.envs.corrected import apply_effects
-
         return apply_effects(env, self.correction)
 
     def zeros_of(self, data: Measurements) -> Zeros:

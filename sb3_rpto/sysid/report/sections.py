@@ -219,7 +219,7 @@ def _errors(found: Results) -> Section:
     if found.data.exact:
         notes.append("The data are exact, so there is no noise floor.")
     return Section(
-        f"Error before and after, on {'test' if tested else 'fitted'} runs",
+        f"Error before and after, on {'test' if tested else 'fitted'} runs: RMSE",
         [] if tested else ["There are no test runs: these errors are those of the runs that were fitted."],
         table=Table(header, rows, numbers=range(3, len(header))),
         figure=partial(figures.errors_by_horizon, found),
