@@ -23,7 +23,7 @@ from sb3_rpto.envs.step_fidelity import beyond_states, observe
 from sb3_rpto.envs.task_rules import Rule, task_rules
 from sb3_rpto.sysid import Episode, Measurements
 from sb3_rpto.sysid.data.coordinates import straight
-from sb3_rpto.sysid.data.encoder_unwrapping import settle_turns
+from sb3_rpto.sysid.data.repairs import remove_whole_turns
 from sb3_rpto.sysid.problem.data_model_consistency import check_clock, check_names
 from sb3_rpto.sysid.shooting.initial_states import HALF_COUNT, HALF_WIDTH, half_step, start_state
 from sb3_rpto.sysid.shooting.windows import command_order, held, noise_levels
@@ -96,7 +96,7 @@ def transitions(
         raise ValueError(f"{env} cannot be copied, which target_data=Measurements needs; give it one of gym.make")
     twin.reset(seed=0)
     base: Any = twin.unwrapped
-    measured, _ = settle_turns(base.model, measured)  # as the trace reads it, which says so
+    measured, _ = remove_whole_turns(base.model, measured)  # as the trace reads it, which says so
     log = _Log(measured, base.model, float(base.dt))
     # Sensors that err show the states as they were measured: the simulator is put where they truly were, but for the
     # joints of late ones, which the copy, as it has no past, shows as they are: where the log saw them.

@@ -2,7 +2,7 @@
 
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding
 from sb3_rpto.sysid.report.report import Report
 from sb3_rpto.sysid.trace import trace  # after its module of the same name, which it stands for from here on
 

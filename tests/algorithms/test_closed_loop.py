@@ -37,7 +37,7 @@ from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Measurements, Report, trace
 from sb3_rpto.sysid.data.encoder_offsets import EncoderOffsets
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 
 TASK = "InvertedDoublePendulum-v5"
 KINDS = ["coulomb_friction", "torque_offset", "quadratic_drag"]
@@ -199,8 +199,8 @@ def test_a_trace_is_logged_before_any_episode_ends(soon: None, tmp_path: Path) -
 def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     made = filled([])
     steps = [
-        Finding("time step", "the model", "with steps of 1 ms it errs less"),
-        Finding("at its bound", "declared pole.length", "0.3 is its bound"),
+        Finding(FindingKind.TIME_STEP, "the model", "with steps of 1 ms it errs less"),
+        Finding(FindingKind.AT_ITS_BOUND, "declared pole.length", "0.3 is its bound"),
     ]
     monkeypatch.setattr(
         controller,
@@ -241,7 +241,7 @@ def test_joints_in_another_order_are_found(soon: None) -> None:
     ):
         made.learn(90, source_timesteps=0)
     assert made.loop is not None
-    (found,) = [f for f in made.loop.reports[0].findings if f.kind == "exchanged"]
+    (found,) = [f for f in made.loop.reports[0].findings if f.kind == FindingKind.EXCHANGED]
     assert found.where == "qpos.hinge, qpos.hinge2"
 
 

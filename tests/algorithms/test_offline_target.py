@@ -28,7 +28,7 @@ from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.effects import LIBRARY, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Measurements, trace
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.settings import ProblemSettings, Settings
 
 TASK, DT = "InvertedPendulum-v5", 0.04
@@ -381,8 +381,8 @@ def test_what_a_log_does_not_tell_is_said_and_phi_is_logged(
     verdict: str, times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vague = [
-        Finding("undetermined", "declared cart.friction", "these data do not tell it"),
-        Finding("at its bound", "declared hinge.damping", "2 is its bound"),
+        Finding(FindingKind.UNDETERMINED, "declared cart.friction", "these data do not tell it"),
+        Finding(FindingKind.AT_ITS_BOUND, "declared hinge.damping", "2 is its bound"),
     ]
     report = dataclasses.replace(learned().loop.reports[0], verdict=verdict, findings=vague)
     monkeypatch.setattr(controller, "trace", lambda *_, **__: report)

@@ -14,6 +14,7 @@ from benchmarks.tracing import first_trace
 from benchmarks.tracing.first_trace import RUNS, Job, first_transitions, noisy_log, run
 from benchmarks.transfer.sources import FOLDER_VARIABLE
 from sb3_rpto.algorithms.closed_loop.controller import FIRST
+from sb3_rpto.sysid.findings import FindingKind
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def test_a_log_holds_noisy_positions_of_the_simulators_steps(folder: Path) -> No
     assert np.allclose(np.diff(noisy.episodes[0].time), 0.01)
     assert len(noisy.episodes[0]) % 5 == 0  # samples of a step of the policy, which all have its command
     assert np.all(noisy.episodes[0].ctrl[:5] == noisy.episodes[0].ctrl[0])
-    assert {f.kind for f in noisy.findings} == {"missing velocity"}
+    assert {f.kind for f in noisy.findings} == {FindingKind.MISSING_VELOCITY}
     noise = np.concatenate([a.qpos - b.qpos for a, b in zip(noisy.episodes, exact.episodes)])
     assert noise.std() == pytest.approx(1e-3, rel=0.1)
 

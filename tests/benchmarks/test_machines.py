@@ -9,6 +9,7 @@ from benchmarks.machines.machines import (
     find_measured,
     simple_pendulum,
 )
+from sb3_rpto.sysid.findings import FindingKind
 
 FOLDER = find_measured()
 measured = pytest.mark.skipif(
@@ -78,7 +79,8 @@ def test_names_of_model_and_data_agree(machines, name):
 @pytest.mark.parametrize("name", MACHINES)
 def test_no_run_is_lost_or_cut(machines, name):
     machine = machines[name]
-    bad = {"duplicate", "gap", "short", "wrapped angle", "flipped velocity", "velocity slope"}
+    cut = {FindingKind.DUPLICATE, FindingKind.GAP, FindingKind.SHORT}
+    bad = {*cut, FindingKind.WRAPPED_ANGLE, FindingKind.FLIPPED_VELOCITY, FindingKind.VELOCITY_SLOPE}
     for data in filter(None, (machine.data, machine.other)):
         assert not bad & {f.kind for f in data.findings}
         for e in data.episodes:

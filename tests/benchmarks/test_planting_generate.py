@@ -14,6 +14,7 @@ from benchmarks.tracing.planting.plants import (
     Spring,
 )
 from benchmarks.tracing.planting.simulation import Simulation
+from sb3_rpto.sysid.findings import FindingKind
 
 SHORT = {"episodes": 4, "duration": 0.8}
 
@@ -107,7 +108,7 @@ def test_each_episode_has_encoders_with_zeros_of_their_own():
 
 def test_jittered_clock_is_recorded_truly():
     planted = generate("pendulum", None, 0, noise=0.0, jitter=0.4, **SHORT)
-    assert {f.kind for f in planted.measurements.findings} == {"jitter"}
+    assert {f.kind for f in planted.measurements.findings} == {FindingKind.JITTER}
     for episode in planted.measurements.episodes:
         step = np.diff(episode.time)
         assert step.min() > 0.6 * 0.005

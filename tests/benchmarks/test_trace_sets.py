@@ -12,6 +12,7 @@ import pytest
 from benchmarks.tracing import encoder_sets, shape_sweep
 from benchmarks.tracing.encoder_sets import MACHINES, QUANTUM, SAMPLES, Job, recorded
 from sb3_rpto.effects import LIBRARY
+from sb3_rpto.sysid.findings import FindingKind
 
 
 def report(verdict: str, *effects: tuple) -> SimpleNamespace:
@@ -38,7 +39,7 @@ def test_samples_are_as_their_name_says(samples: str) -> None:
     data = recorded(Job("servo", samples, lacking=True))
     steps = np.concatenate([e.qpos / QUANTUM for e in data.episodes])
     assert np.allclose(steps, np.round(steps), atol=1e-6) == quantised
-    assert ("missing velocity" in {f.kind for f in data.findings}) == (not velocity)
+    assert (FindingKind.MISSING_VELOCITY in {f.kind for f in data.findings}) == (not velocity)
     intervals = np.concatenate([np.diff(e.time) for e in data.episodes])
     assert (np.ptp(intervals) > 1e-4) == jitters
     assert intervals.mean() == pytest.approx(0.01, rel=0.01)

@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_rpto.effects import LIBRARY, Effect
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Measurements, trace
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.hypotheses.hypothesis import kept_effects
 
 OWN = """<mujoco><option timestep="0.005"/><worldbody><body name="pole">
@@ -31,7 +32,7 @@ def test_dry_friction_is_found_as_the_robot_has_it(kind: str, noise: float) -> N
     assert report.verdict == "explained"
     assert [traced.label for traced in report.effects] == [f"{kind}(hinge)"]
     assert report.effects[0].effect.values == pytest.approx([0.3], rel=1e-2 if noise else 1e-6)
-    assert [f.kind for f in report.findings].count("soft friction") == (kind == "soft_friction")
+    assert [f.kind for f in report.findings].count(FindingKind.SOFT_FRICTION) == (kind == "soft_friction")
 
 
 @pytest.mark.slow
@@ -96,7 +97,7 @@ def test_what_came_before_a_run_is_told_by_its_first_steps(lacks: str) -> None:
         [] if lacks == "nothing" else [(f"command_delay({name})", lacks == "a queue")]
     )
     assert [t.effect.values[0] for t in report.effects] == pytest.approx([delay] * len(report.effects), rel=1e-3)
-    assert [f.kind for f in report.findings].count("idle start") == (lacks == "a queue")
+    assert [f.kind for f in report.findings].count(FindingKind.IDLE_START) == (lacks == "a queue")
     corrected = report.apply(gym.make("InvertedDoublePendulum-v5"))
     for seed in (3, 4):
         seen = [env.reset(seed=seed)[0] for env in (target, corrected)]
@@ -189,7 +190,7 @@ def test_a_force_that_a_wrapper_writes_once_a_step_is_found_as_it_is_held(kind: 
     assert report.verdict == "explained"
     assert [traced.label for traced in report.effects] == [f"{kind}(slider)"]
     assert report.effects[0].effect.values == pytest.approx([value], rel=1e-3)
-    assert [f.kind for f in report.findings].count("held forces") == 1
+    assert [f.kind for f in report.findings].count(FindingKind.HELD_FORCES) == 1
     # The corrected environment moves as the target does.
     target = Braked(gym.make("InvertedDoublePendulum-v5"), kind)
     corrected = report.apply(gym.make("InvertedDoublePendulum-v5"))
@@ -208,7 +209,7 @@ def test_a_held_force_is_found_beside_another_effect() -> None:
     assert report.verdict == "explained"
     values = {traced.label: traced.effect.values[0] for traced in report.effects}
     assert values == pytest.approx({"held_drag(slider)": 2.0, "command_gain(slide)": -0.2}, rel=1e-2)
-    assert [f.kind for f in report.findings].count("held forces") == 1
+    assert [f.kind for f in report.findings].count(FindingKind.HELD_FORCES) == 1
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.sysid import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.hypotheses.column_errors import ColumnErrors, readings
 from sb3_rpto.sysid.problem.problem import Inputs, prepare
 from sb3_rpto.sysid.selection.search import SearchResult, SelectorPair
@@ -72,12 +72,12 @@ TOLD = {"ctrl.first": "ctrl.second", "ctrl.second": "ctrl.first"}
     ("late", "names", "signs", "said"),
     [
         (0, {}, {}, []),
-        (1, {}, {}, [("early response", {"all episodes", "ctrl"})]),
-        (0, EXCHANGED, {}, [("exchanged", {"qpos.shoulder", "qpos.elbow"})]),
-        (0, TOLD, {}, [("exchanged", {"ctrl.first", "ctrl.second"})]),
-        (0, EXCHANGED | TOLD, {}, [("exchanged", {*EXCHANGED, *TOLD})]),
-        (0, {}, {"qpos.elbow": -1.0}, [("reversed", {"qpos.elbow"})]),
-        (0, {}, {"qpos.elbow": -1.0, "ctrl.second": -1.0}, [("reversed", {"qpos.elbow", "ctrl.second"})]),
+        (1, {}, {}, [(FindingKind.EARLY_RESPONSE, {"all episodes", "ctrl"})]),
+        (0, EXCHANGED, {}, [(FindingKind.EXCHANGED, {"qpos.shoulder", "qpos.elbow"})]),
+        (0, TOLD, {}, [(FindingKind.EXCHANGED, {"ctrl.first", "ctrl.second"})]),
+        (0, EXCHANGED | TOLD, {}, [(FindingKind.EXCHANGED, {*EXCHANGED, *TOLD})]),
+        (0, {}, {"qpos.elbow": -1.0}, [(FindingKind.REVERSED, {"qpos.elbow"})]),
+        (0, {}, {"qpos.elbow": -1.0, "ctrl.second": -1.0}, [(FindingKind.REVERSED, {"qpos.elbow", "ctrl.second"})]),
     ],
     ids=[
         "as it is",
@@ -99,7 +99,11 @@ def test_what_was_logged_otherwise_is_told_though_something_is_missing_too(
 def test_an_exchange_and_a_sign_are_undone_by_themselves() -> None:
     model, data = mujoco.MjModel.from_xml_string(ARM), Measurements.from_tables(recorded())
     found = list(readings(model, data))
-    assert [r.kind for r in found] == ["early response", *["exchanged"] * 3, *["reversed"] * 4]
+    assert [r.kind for r in found] == [
+        FindingKind.EARLY_RESPONSE,
+        *[FindingKind.EXCHANGED] * 3,
+        *[FindingKind.REVERSED] * 4,
+    ]
     episode = data.episodes[0]
     ways = []
     for reading in found[1:]:
@@ -114,5 +118,5 @@ def test_an_exchange_and_a_sign_are_undone_by_themselves() -> None:
 def test_one_of_several_commands_of_an_actuator_is_not_a_joints() -> None:
     model, tables = mujoco.MjModel.from_xml_string(ARM), recorded()
     data = misheard(tables, {"ctrl.first": "ctrl.first.0"}, {})
-    said = [reading.where for reading in readings(model, data) if reading.kind == "reversed"]
+    said = [reading.where for reading in readings(model, data) if reading.kind == FindingKind.REVERSED]
     assert said == ["qpos.shoulder", "qpos.elbow", "qpos.elbow, ctrl.second"]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.sysid import Measurements, trace
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.problem.contacts import contact_changes
 from sb3_rpto.sysid.shooting.initial_states import misfit
 from sb3_rpto.sysid.shooting.windows import noise_levels
@@ -108,7 +109,7 @@ def test_a_smoothed_start_is_less_certain_where_a_velocity_jumps(jump: float, lo
 @pytest.mark.slow
 def test_a_complete_model_that_hops_is_complete() -> None:
     report = trace(LEG, hops(runs=6), ["knee.damping"], candidates=["coulomb_friction"], seed=0)
-    (finding,) = (f for f in report.findings if f.kind == "contacts")
+    (finding,) = (f for f in report.findings if f.kind == FindingKind.CONTACTS)
     assert "windows of 0.1 s" in finding.message
     assert report.verdict == "complete"
     assert report.declared[0].effect.values[0] == pytest.approx(4, rel=0.05)

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.sysid import Measurements
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.problem.data_model_consistency import _correlate, _Force, check_against, unlikely_columns
 
 ARM = """<mujoco>
@@ -86,7 +87,7 @@ def test_a_command_flipped_in_one_run(kind):
     model = model_of(kind)
     tables = measured(model)
     tables["run1"]["ctrl.second"] *= -1
-    assert found(model, tables) == [("flipped sign", "run1, ctrl.second")]
+    assert found(model, tables) == [(FindingKind.FLIPPED_SIGN, "run1, ctrl.second")]
 
 
 def test_a_motor_that_turns_the_other_way_in_runs_that_say_so_is_not_flipped():
@@ -99,7 +100,9 @@ def test_a_motor_that_turns_the_other_way_in_runs_that_say_so_is_not_flipped():
     assert found(model, tables) == []
     for table in tables.values():
         table["param.second.gear"][:] = gear
-    assert {(kind, where.split(",")[1]) for kind, where in found(model, tables)} == {("flipped sign", " ctrl.second")}
+    assert {(kind, where.split(",")[1]) for kind, where in found(model, tables)} == {
+        (FindingKind.FLIPPED_SIGN, " ctrl.second")
+    }
 
 
 def test_a_command_flipped_in_all_runs():
@@ -109,7 +112,7 @@ def test_a_command_flipped_in_all_runs():
         table["ctrl.first"] *= -1
     data = Measurements.from_tables(tables)
     (finding,) = check_against(model, data)
-    assert (finding.kind, finding.where) == ("flipped sign", "all episodes, ctrl.first")
+    assert (finding.kind, finding.where) == (FindingKind.FLIPPED_SIGN, "all episodes, ctrl.first")
     assert "in every run" in finding.message
 
 
@@ -137,7 +140,7 @@ def test_a_measured_torque():
     tables = with_torque(measured(model))
     assert found(model, tables) == []
     tables["run2"]["qfrc.elbow"] *= -1
-    assert found(model, tables) == [("flipped sign", "run2, qfrc.elbow")]
+    assert found(model, tables) == [(FindingKind.FLIPPED_SIGN, "run2, qfrc.elbow")]
 
 
 @pytest.mark.parametrize("delay", [5, 9])
@@ -145,8 +148,8 @@ def test_a_late_response_is_measured_in_samples(delay):
     model = model_of()
     findings = check_against(model, Measurements.from_tables(measured(model, delay=delay)))
     assert sorted((f.kind, f.where) for f in findings) == [
-        ("late response", "all episodes, ctrl.first"),
-        ("late response", "all episodes, ctrl.second"),
+        (FindingKind.LATE_RESPONSE, "all episodes, ctrl.first"),
+        (FindingKind.LATE_RESPONSE, "all episodes, ctrl.second"),
     ]
     assert all(f"about {delay} samples ({delay * 0.01:.3g} s)" in f.message for f in findings)
 
@@ -155,7 +158,7 @@ def test_a_late_and_flipped_command():
     model = model_of()
     tables = measured(model, delay=6)
     tables["run0"]["ctrl.first"] *= -1
-    assert ("flipped sign", "run0, ctrl.first") in found(model, tables)
+    assert (FindingKind.FLIPPED_SIGN, "run0, ctrl.first") in found(model, tables)
 
 
 def test_samples_that_are_switched_off_or_not_usable_do_not_count():
@@ -169,7 +172,7 @@ def test_samples_that_are_switched_off_or_not_usable_do_not_count():
     for table in tables.values():
         del table["enabled.first"]
     data = Measurements.from_tables(tables)
-    assert [f.kind for f in check_against(model, data)] == ["flipped sign"]
+    assert [f.kind for f in check_against(model, data)] == [FindingKind.FLIPPED_SIGN]
     for episode in data.episodes:
         episode.usable[:] = ~off
     assert check_against(model, data) == []
@@ -181,16 +184,16 @@ def test_the_step_must_be_a_multiple_of_the_timestep():
     coarse = model_of()
     coarse.opt.timestep = 0.003
     (finding,) = check_against(coarse, Measurements.from_tables(tables))
-    assert (finding.kind, finding.where) == ("sampling", "all episodes, time")
+    assert (finding.kind, finding.where) == (FindingKind.SAMPLING, "all episodes, time")
     assert "0.0025 s" in finding.message
     coarse.opt.timestep = 0.02  # a timestep longer than the step is no multiple either
-    assert ("sampling", "all episodes, time") in found(coarse, tables)
+    assert (FindingKind.SAMPLING, "all episodes, time") in found(coarse, tables)
 
 
 def test_a_machine_that_is_sampled_slowly():
     model = model_of()
     tables = measured(model, substeps=20, hold=8)
-    assert found(model, tables) == [("slow sampling", "all episodes, time")]
+    assert found(model, tables) == [(FindingKind.SLOW_SAMPLING, "all episodes, time")]
 
 
 def test_times_in_milliseconds_are_refused():
@@ -218,8 +221,8 @@ def test_angles_that_may_be_degrees_and_commands_that_never_change():
         table["ctrl.second"] = 0 * table["ctrl.second"]
     said = [(f.kind, f.where) for f in unlikely_columns(model_of(), Measurements.from_tables(tables))]
     assert said == [
-        ("large angle", "all episodes, qpos.elbow"),
-        ("constant command", "all episodes, ctrl.second"),
+        (FindingKind.LARGE_ANGLE, "all episodes, qpos.elbow"),
+        (FindingKind.CONSTANT_COMMAND, "all episodes, ctrl.second"),
     ]
 
 
@@ -272,7 +275,7 @@ def test_commands_that_the_model_clips():
     limited = KINDS["motor"].replace('gear="2"', 'gear="2" ctrlrange="-0.5 0.5" ctrllimited="true"')
     model = mujoco.MjModel.from_xml_string(ARM.replace("ACTUATORS", limited))
     data = Measurements.from_tables({"run": told})
-    (finding,) = (f for f in check_against(model, data) if f.kind == "clipped command")
+    (finding,) = (f for f in check_against(model, data) if f.kind == FindingKind.CLIPPED_COMMAND)
     assert finding.where == "all episodes, ctrl.first"
     share = np.mean(np.abs(told["ctrl.first"]) > 0.501)
     assert finding.message.startswith(f"{share:.1%} of the samples are outside the model's ctrlrange [-0.5, 0.5]")

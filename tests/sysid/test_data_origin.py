@@ -9,6 +9,7 @@ from sb3_rpto.effects import LIBRARY
 from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Measurements, trace
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.problem.data_origin import are_exact_states, find_origin, may_be_exact
 from sb3_rpto.sysid.problem.problem import Assumptions, Inputs, prepare
 
@@ -25,7 +26,7 @@ def test_a_complete_simulator_that_was_logged_is_complete(noise: float) -> None:
     report = trace(OWN, data, DECLARED, candidates=["coulomb_friction", "torque_offset"], threads=1)
     assert report.verdict == "complete"
     assert report.data.exact == (noise == 0)
-    assert [f.kind for f in report.findings].count("simulated") == 1
+    assert [f.kind for f in report.findings].count(FindingKind.SIMULATED) == 1
     np.testing.assert_allclose([t.effect.values[0] for t in report.declared], [0.05, 0.5], rtol=1e-2)
 
 
@@ -48,7 +49,7 @@ def test_own_steps_are_recognised_once_what_is_missing_is_found() -> None:
     assert find_origin(compiled(OWN), data, DECLARED, np.array([1e-3]), 0.8, 1) == "machine"
     report = trace(OWN, data, DECLARED, candidates=["coulomb_friction"], threads=1)
     assert report.verdict == "explained"
-    assert ["searched again" in f.message for f in report.findings if f.kind == "simulated"] == [True]
+    assert ["searched again" in f.message for f in report.findings if f.kind == FindingKind.SIMULATED] == [True]
     np.testing.assert_allclose([t.effect.values[0] for t in report.declared], [0.05, 0.5], rtol=0.05)
     assert report.effects[0].effect.values == pytest.approx([0.3], rel=0.02)
 
@@ -84,7 +85,7 @@ def test_a_simulator_that_was_logged_as_slowly_as_it_is_commanded_is_exact(offse
     assert report.verdict == ("explained" if offset else "complete")
     assert [traced.label for traced in report.effects] == (["torque_offset(hinge)"] if offset else [])
     assert all(traced.effect.values == pytest.approx([offset], rel=1e-4) for traced in report.effects)
-    assert ["searched again" in f.message for f in report.findings if f.kind == "simulated"] == [True]
+    assert ["searched again" in f.message for f in report.findings if f.kind == FindingKind.SIMULATED] == [True]
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-4])

@@ -12,6 +12,7 @@ from simulated import PENDULUM, WITH_WHEEL, compiled, recorded
 from sb3_rpto.effects import LIBRARY, Simulation
 from sb3_rpto.effects.forces import Spring, TorqueOffset
 from sb3_rpto.sysid import Finding, Measurements, trace
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.hypotheses.finer_steps import FinerSteps
 from sb3_rpto.sysid.report.diagnostics import (
     above_noise,
@@ -42,7 +43,7 @@ def test_a_model_that_few_windows_pass_is_told_where_the_test_runs_deny_it(
     after = replace(ERROR, low=np.array([low, 0.9e-3]))
     errors = [after, replace(after, horizon="whole run")]
     found = above_noise(errors, [FLOOR], ratio, length=0.8)
-    assert [f.kind for f in found] == ["few windows"] * told
+    assert [f.kind for f in found] == [FindingKind.FEW_WINDOWS] * told
     assert above_noise(errors, [FLOOR], ratio, length=1.1) == []  # over so little the starts decide
 
 
@@ -182,5 +183,5 @@ def test_friction_that_creeps_as_mujocos_does_by_default_is_told(constraint: str
     data = Measurements.from_tables(tables)
     report = trace(coarse, data, ["hinge.damping"], known=known, candidates=[], threads=1)
     assert (report.verdict == "complete") == bool(constraint)
-    told = [f.where for f in report.findings if f.kind == "soft friction"]
+    told = [f.where for f in report.findings if f.kind == FindingKind.SOFT_FRICTION]
     assert told == ([] if constraint else ["coulomb_friction(hinge)"])

@@ -13,6 +13,7 @@ from sb3_rpto.sysid import Measurements
 from sb3_rpto.sysid.data.columns import columns_of, read_columns
 from sb3_rpto.sysid.data.from_transitions import chain
 from sb3_rpto.sysid.data.signal_quality import smoothed_velocity
+from sb3_rpto.sysid.findings import FindingKind
 
 HALF = {"Hopper-v5": 20, "Reacher-v5": 50, "HalfCheetah-v5": 60, "InvertedDoublePendulum-v5": 30}
 
@@ -87,7 +88,7 @@ def test_a_buffer_gives_back_the_episodes():
     assert data.unobserved == ("rootx",)
     assert data.exact
     np.testing.assert_allclose(np.diff(data.episodes[0].time), 0.008)
-    assert kinds(data) == ["unobserved"]
+    assert kinds(data) == [FindingKind.UNOBSERVED]
     assert not Measurements.from_replay(recorder.buffer, recorder.envs[0], exact=False).exact
 
 
@@ -111,7 +112,7 @@ def test_samples_at_a_clip_are_not_usable():
     for episode, mask in zip(data.episodes, clipped):
         np.testing.assert_array_equal(episode.usable, ~mask)
         assert episode.placed.all()  # the bound is of speeds alone
-    counts = {f.where.split(".")[1]: int(f.message.split()[2]) for f in data.findings if f.kind == "clipped"}
+    counts = {f.where.split(".")[1]: int(f.message.split()[2]) for f in data.findings if f.kind == FindingKind.CLIPPED}
     speeds = np.concatenate([np.array(e["qvel"]) for e in recorder.long_ones()])
     for name, count in counts.items():
         assert count == (np.abs(speeds[:, data.columns.qvel.index(name)]) >= 10).sum()
@@ -122,7 +123,7 @@ def test_samples_at_a_clip_are_not_usable():
 def test_several_environments(n_envs, dual):
     recorder = Recorder(n_envs=n_envs, dual=dual)
     data = Measurements.from_replay(recorder.buffer, recorder.envs[0])
-    assert "gap" not in kinds(data)
+    assert FindingKind.GAP not in kinds(data)
     key = lambda rows: tuple(rows[0])  # noqa: E731
     truth = sorted(recorder.long_ones(), key=lambda e: key(np.array(e["qpos"])[:, 1:].round(6)))
     episodes = sorted(data.episodes, key=lambda e: key(e.qpos[:, 1:].round(6)))
@@ -161,7 +162,7 @@ def test_turns_are_followed_with_the_velocity():
     data = Measurements.from_replay(recorder.buffer, env)
     assert np.ptp(np.array(qpos)[:, 0]) > 10 * np.pi
     np.testing.assert_allclose(data.episodes[0].qpos, np.array(qpos), atol=1e-6)
-    assert kinds(data) == ["wrapped angle"]
+    assert kinds(data) == [FindingKind.WRAPPED_ANGLE]
 
 
 def test_broken_chains_are_cut_and_counted():
@@ -171,7 +172,7 @@ def test_broken_chains_are_cut_and_counted():
     buffer.observations[20] += 1e-3
     data = Measurements.from_replay(buffer, recorder.envs[0])
     assert [len(e) for e in data.episodes] == [21, 41]
-    assert [f.message for f in data.findings if f.kind == "gap"] == [
+    assert [f.message for f in data.findings if f.kind == FindingKind.GAP] == [
         "1 time(s) a transition does not begin where one before it ended; cut there"
     ]
 
@@ -181,7 +182,9 @@ def test_short_episodes_are_dropped_and_counted():
     recorder.buffer.dones[0] = 1
     data = Measurements.from_replay(recorder.buffer, recorder.envs[0])
     assert [len(e) for e in data.episodes] == [60]
-    assert [f.message for f in data.findings if f.kind == "short"] == ["1 of 2 with fewer than 2 transitions; dropped"]
+    assert [f.message for f in data.findings if f.kind == FindingKind.SHORT] == [
+        "1 of 2 with fewer than 2 transitions; dropped"
+    ]
     recorder.buffer.dones[:] = 1
     with pytest.raises(ValueError, match="none with 2 transitions"):
         Measurements.from_replay(recorder.buffer, recorder.envs[0])
@@ -209,14 +212,14 @@ def test_a_users_action_wrapper_belongs_to_the_machine():
     recorder = Recorder(make=lambda env_id, **kwargs: Deadband(gym.make(env_id, **kwargs)))
     data = Measurements.from_replay(recorder.buffer, recorder.envs[0])
     assert (np.abs(data.episodes[0].ctrl) < 0.3).any()
-    assert "wrapper" in kinds(data)
+    assert FindingKind.WRAPPER in kinds(data)
 
 
 def test_pushers_object_is_rough_and_its_velocity_estimated():
     recorder = Recorder("Pusher-v5", steps=40)
     data = Measurements.from_replay(recorder.buffer, recorder.envs[0])
     assert data.unobserved == data.columns.missing == ("obj_slidey", "obj_slidex")
-    assert kinds(data) == ["missing velocity", "unobserved"]
+    assert kinds(data) == [FindingKind.MISSING_VELOCITY, FindingKind.UNOBSERVED]
     (episode,) = data.episodes
     assert episode.usable.all()
     assert np.isfinite(episode.qvel).all()
@@ -241,7 +244,7 @@ def test_sb3_itself_fills_the_buffer():
     model.learn(100)
     data = Measurements.from_replay(model.replay_buffer, model.get_env())
     assert sum(len(e) - 1 for e in data.episodes) >= 95
-    assert set(kinds(data)) <= {"clipped", "unobserved", "short"}
+    assert set(kinds(data)) <= {FindingKind.CLIPPED, FindingKind.UNOBSERVED, FindingKind.SHORT}
     for episode in data.episodes:
         moved = 0.004 * (episode.qvel[1:, 1] + episode.qvel[:-1, 1])
         np.testing.assert_allclose(np.diff(episode.qpos[:, 1]), moved, atol=2e-3)
@@ -318,7 +321,7 @@ def test_a_speed_that_is_not_observed_is_estimated(monkeypatch):
     recorder = blind(True, monkeypatch)
     data = Measurements.from_replay(recorder.buffer, recorder.envs[0])
     assert data.columns.missing == ("hinge",)
-    assert kinds(data) == ["missing velocity"]
+    assert kinds(data) == [FindingKind.MISSING_VELOCITY]
     long = [e for e in data.episodes if len(e) >= 5]
     assert len(long) >= 2
     for episode in long:

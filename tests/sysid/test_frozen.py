@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.sysid import Measurements, Report, trace
+from sb3_rpto.sysid.findings import FindingKind
 
 MASS, LOAD, DAMPING, GEAR, RATE, NOISE = 0.5, 0.6, 3.0, 40.0, 200, 5e-4
 LIFT = f"""<mujoco><option timestep="0.005" integrator="{{}}"/><worldbody><body name="quill">
@@ -43,6 +44,6 @@ def test_the_load_is_found_though_a_damping_could_freeze_the_lift(integrator: st
     (damping,) = report.declared
     assert damping.effect.values[0] == pytest.approx(DAMPING, rel=0.1)
     assert report.before[0].rmse[0] < 1.0  # of a lift that moves, not of one that blew up
-    said = [f.message for f in report.findings if f.kind in ("unstable", "own steps")]
+    said = [f.message for f in report.findings if f.kind in (FindingKind.UNSTABLE, FindingKind.OWN_STEPS)]
     assert len(said) == astray  # the saved lift takes Euler's long steps
     assert all("(EULER, 0.005 s)" in message for message in said)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.sysid import Measurements, trace
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.shooting.windows import noise_levels
 
 SERVO = """<mujoco><option timestep="0.01"/><worldbody><body name="pole">
@@ -41,7 +42,7 @@ def test_noise_that_is_mostly_motion_is_told(hold: int) -> None:
     assert report.verdict == "complete"
     vague = hold == 1
     assert (noise_levels(data)[0] > 2 * NOISE) == vague
-    assert [f.kind == "vague noise" for f in report.findings].count(True) == vague
+    assert [f.kind == FindingKind.VAGUE_NOISE for f in report.findings].count(True) == vague
 
 
 @pytest.mark.parametrize("lacks", ["nothing", "dry friction"])

@@ -19,8 +19,7 @@ from sb3_rpto.effects.friction import CoulombFriction
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Measurements, trace
 from sb3_rpto.sysid.data.columns import columns_of
-from sb3_rpto.sysid.data.measurements import Noise
-from sb3_rpto.sysid.data.recording import Episode
+from sb3_rpto.sysid.data.recording import Episode, Noise
 from sb3_rpto.sysid.selection.adequacy import adequacy
 from sb3_rpto.sysid.shooting.initial_states import start_state
 from sb3_rpto.sysid.shooting.prediction_errors import horizon_errors, noise_floor

@@ -16,15 +16,9 @@ from benchmarks.tracing.planting import generate
 from sb3_rpto.sysid import Measurements
 from sb3_rpto.sysid.data import signal_quality
 from sb3_rpto.sysid.data.columns import columns_of, read_columns
-from sb3_rpto.sysid.data.signal_quality import (
-    SLOPE,
-    grouped,
-    quantum,
-    smoothed_velocity,
-    split_at_gaps,
-    unwrap,
-    velocity_slope,
-)
+from sb3_rpto.sysid.data.settings import DATA
+from sb3_rpto.sysid.data.signal_quality import quantum, smoothed_velocity, split_at_gaps, unwrap, velocity_slope
+from sb3_rpto.sysid.findings import Finding, FindingKind, grouped
 
 MEASURED = Path(__file__).parents[3] / "shared" / "measured"
 
@@ -63,7 +57,7 @@ def write_csv(path, table):
 def test_it_prints_in_a_line():
     data = several(2)
     assert repr(data) == str(data) == "<Measurements: 2 episodes, 400 samples, 3.98 s; joints hinge; actuators motor>"
-    gaps = [signal_quality.Finding("gap", f"episode {i}", "cut in two") for i in range(3)]
+    gaps = [Finding(FindingKind.GAP, f"episode {i}", "cut in two") for i in range(3)]
     assert str(replace(data, findings=gaps)) == f"{data!r}\n  gap in episode 0, episode 1 and episode 2: cut in two"
 
 
@@ -210,7 +204,7 @@ def test_a_run_with_another_clock_is_refused_by_name(other):
 def test_what_is_found_in_many_places_is_said_once():
     tables = {f"run{i}": {k: v for k, v in swing(phase=i).items() if k != "qvel.hinge"} for i in range(3)}
     (once,) = grouped(Measurements.from_tables(tables).findings)
-    assert (once.kind, once.where) == ("missing velocity", "qvel.hinge of run0, run1 and run2")
+    assert (once.kind, once.where) == (FindingKind.MISSING_VELOCITY, "qvel.hinge of run0, run1 and run2")
     assert once.runs == ("run0", "run1", "run2")
 
 
@@ -221,10 +215,10 @@ def test_what_differs_by_run_in_numbers_alone_is_a_line_with_their_range():
         table["time"] = table["time"] + (0.002 + 0.0002 * run) * rng.uniform(-1, 1, 200)
         tables[f"run{run}"] = {k: v for k, v in table.items() if k != "qvel.hinge"}
     data = Measurements.from_tables(tables)
-    shares = [f.message.split()[3].rstrip("%") for f in data.findings if f.kind == "jitter"]
+    shares = [f.message.split()[3].rstrip("%") for f in data.findings if f.kind == FindingKind.JITTER]
     assert len(shares) == 8
     found = grouped(data.findings)
-    assert [f.kind for f in found] == ["jitter", "missing velocity"]
+    assert [f.kind for f in found] == [FindingKind.JITTER, FindingKind.MISSING_VELOCITY]
     assert found[0].where == "time of run0, run1, run2, run3, run4, run5 and 2 more"
     least, most = min(shares, key=int), max(shares, key=int)
     assert found[0].message.startswith(f"steps vary by {least} to {most}% around their median of ")
@@ -234,35 +228,35 @@ def test_what_differs_by_run_in_numbers_alone_is_a_line_with_their_range():
 
 
 def test_a_finding_is_said_of_several_places_and_numbers_of_names_are_no_range():
-    of_run, plain = signal_quality.Finding.of_run, signal_quality.Finding
+    of_run, plain = Finding.of_run, Finding
     found = grouped(
         [
-            of_run("gap", "a", "", "1 gap(s), the longest 0.5 s"),
-            of_run("glitch", "a", "qpos.x", "3 far"),
-            of_run("glitch", "a", "qpos.y", "3 far"),
-            of_run("gap", "b", "", "12 gap(s), the longest -1.5e-05 s"),
-            of_run("glitch", "b", "qpos.x", "3 far"),
-            of_run("glitch", "b", "qpos.y", "3 far"),
-            of_run("slope", "a", "qvel.x", "it is 2"),
-            of_run("slope", "b", "qvel.y", "it is 3"),
-            of_run("duplicate", "a", "", "the same as episode '1'"),
-            of_run("duplicate", "b", "", "the same as episode '2'"),
-            of_run("other", "a", "", "motor2 moves"),
-            of_run("other", "b", "", "motor3 moves"),
-            plain("soft tie", "equality 0", "gives way over 20 ms"),
-            plain("soft tie", "equality 1", "gives way over 20 ms"),
-            plain("soft tie", "equality 2", "gives way over 30 ms"),
+            of_run(FindingKind.GAP, "a", "", "1 gap(s), the longest 0.5 s"),
+            of_run(FindingKind.GLITCH, "a", "qpos.x", "3 far"),
+            of_run(FindingKind.GLITCH, "a", "qpos.y", "3 far"),
+            of_run(FindingKind.GAP, "b", "", "12 gap(s), the longest -1.5e-05 s"),
+            of_run(FindingKind.GLITCH, "b", "qpos.x", "3 far"),
+            of_run(FindingKind.GLITCH, "b", "qpos.y", "3 far"),
+            of_run(FindingKind.VELOCITY_SLOPE, "a", "qvel.x", "it is 2"),
+            of_run(FindingKind.VELOCITY_SLOPE, "b", "qvel.y", "it is 3"),
+            of_run(FindingKind.DUPLICATE, "a", "", "the same as episode '1'"),
+            of_run(FindingKind.DUPLICATE, "b", "", "the same as episode '2'"),
+            of_run(FindingKind.JUMP, "a", "", "motor2 moves"),
+            of_run(FindingKind.JUMP, "b", "", "motor3 moves"),
+            plain(FindingKind.SOFT_TIE, "equality 0", "gives way over 20 ms"),
+            plain(FindingKind.SOFT_TIE, "equality 1", "gives way over 20 ms"),
+            plain(FindingKind.SOFT_TIE, "equality 2", "gives way over 30 ms"),
         ]
     )
     assert [str(one) for one in found] == [
         "gap in a and b: 1 to 12 gap(s), the longest -1.5e-05 to 0.5 s",
         "glitch in qpos.x and qpos.y of a and b: 3 far",
-        "slope in a, qvel.x: it is 2",
-        "slope in b, qvel.y: it is 3",
+        "velocity slope in a, qvel.x: it is 2",
+        "velocity slope in b, qvel.y: it is 3",
         "duplicate in a: the same as episode '1'",
         "duplicate in b: the same as episode '2'",
-        "other in a: motor2 moves",
-        "other in b: motor3 moves",
+        "jump in a: motor2 moves",
+        "jump in b: motor3 moves",
         "soft tie in equality 0 and equality 1: gives way over 20 ms",
         "soft tie in equality 2: gives way over 30 ms",
     ]
@@ -328,7 +322,7 @@ def test_gap_splits_the_episode_and_keeps_the_run_together():
     table["time"][80:] += 0.2
     data = Measurements.from_tables({"a": table})
     assert [(e.name, e.run, len(e)) for e in data.episodes] == [("a/0", "a", 80), ("a/1", "a", 120)]
-    assert kinds(data) == ["gap"]
+    assert kinds(data) == [FindingKind.GAP]
     train, select, test = data.split(0)
     assert [len(m.episodes) for m in (train, select, test)] == [2, 0, 0]
 
@@ -365,7 +359,7 @@ def test_short_stretch_is_set_aside_with_a_finding():
     table["time"][197:] += 0.2
     data = Measurements.from_tables({"a": table})
     assert [len(e) for e in data.episodes] == [197]
-    assert kinds(data) == ["gap", "short"]
+    assert kinds(data) == [FindingKind.GAP, FindingKind.SHORT]
 
 
 @given(st.lists(st.floats(1e-3, 10.0), max_size=60))
@@ -383,13 +377,13 @@ def test_many_missing_rows_are_no_jitter():
     table = swing(n=300)
     kept = np.random.default_rng(0).uniform(size=300) > 0.1
     found = Measurements.from_tables({"a": {name: column[kept] for name, column in table.items()}}).findings
-    assert {f.kind for f in found} == {"missing rows"}
+    assert {f.kind for f in found} == {FindingKind.MISSING_ROWS}
 
 
 def test_jitter_is_reported():
     time = np.arange(200) * 0.01 + np.random.default_rng(0).uniform(-0.002, 0.002, 200)
     table = {"time": time, "qpos.hinge": np.sin(time), "qvel.hinge": np.cos(time)}
-    assert kinds(Measurements.from_tables({"a": table})) == ["jitter"]
+    assert kinds(Measurements.from_tables({"a": table})) == [FindingKind.JITTER]
 
 
 def test_rows_that_are_missing_from_a_regular_clock_are_told():
@@ -397,7 +391,7 @@ def test_rows_that_are_missing_from_a_regular_clock_are_told():
     table, kept = swing(), np.ones(200, dtype=bool)
     kept[[20, 50, 51, 52, 90]] = False
     (found,) = Measurements.from_tables({"a": {name: values[kept] for name, values in table.items()}}).findings
-    assert found.kind == "missing rows"
+    assert found.kind == FindingKind.MISSING_ROWS
     assert found.message.startswith("3 step(s) are longer")
 
 
@@ -406,7 +400,7 @@ def test_wrapped_angle_is_unwrapped_and_reported():
     true = 5 * np.sin(3 * time) + 2
     wrapped = np.angle(np.exp(1j * true))
     data = Measurements.from_tables({"a": {"time": time, "qpos.hinge": wrapped, "qvel.hinge": 15 * np.cos(3 * time)}})
-    assert kinds(data) == ["wrapped angle"]
+    assert kinds(data) == [FindingKind.WRAPPED_ANGLE]
     np.testing.assert_allclose(data.episodes[0].qpos[:, 0], true, rtol=0, atol=1e-12)
 
 
@@ -432,7 +426,9 @@ def test_steps_that_are_no_motion_are_told(make, said, measured):
     table = {"time": TIME, "qpos.wheel": make()}
     if measured:
         table["qvel.wheel"] = np.gradient(rotor(0.0), 0.01)
-    (found,) = [finding for finding in Measurements.from_tables({"a": table}).findings if finding.kind == "jump"]
+    (found,) = [
+        finding for finding in Measurements.from_tables({"a": table}).findings if finding.kind == FindingKind.JUMP
+    ]
     assert re.match(said, found.message)
 
 
@@ -479,13 +475,13 @@ def taps(every: int) -> dict:
 
 def test_taps_that_a_command_asks_for_are_motion():
     assert signal_quality.glitches(TIME, taps(150)["qpos.finger"]).sum() == 18
-    assert "glitch" not in kinds(Measurements.from_tables({"a": taps(150)}))
+    assert FindingKind.GLITCH not in kinds(Measurements.from_tables({"a": taps(150)}))
 
 
 def test_many_samples_that_look_like_no_readings_are_kept():
     table = {name: column for name, column in taps(150).items() if name != "ctrl.finger"}
     data = Measurements.from_tables({"a": table})
-    (told,) = [finding for finding in data.findings if finding.kind == "glitch"]
+    (told,) = [finding for finding in data.findings if finding.kind == FindingKind.GLITCH]
     assert "18 sample(s)" in told.message
     assert "kept, as they are many" in told.message
     assert data.episodes[0].usable.all()
@@ -499,12 +495,14 @@ def test_samples_that_are_no_readings_are_bridged_told_and_not_compared(reading,
     wrong = np.isin(np.arange(1500), [200 + k for k in range(rows)] + [777, 1100])
     table = {"time": TIME, "qpos.slide": np.where(wrong, reading, true), "qpos.other": true}
     data = Measurements.from_tables({"a": table})
-    (told,) = [finding for finding in data.findings if finding.kind not in ("missing velocity", "jump")]
-    assert (told.kind, told.where) == ("glitch", "a, qpos.slide")
+    (told,) = [
+        finding for finding in data.findings if finding.kind not in (FindingKind.MISSING_VELOCITY, FindingKind.JUMP)
+    ]
+    assert (told.kind, told.where) == (FindingKind.GLITCH, "a, qpos.slide")
     assert told.message.startswith(
         f"{rows + 2} sample(s) far from those before and after, the first {reading:.4g} at 2 s"
     )
-    assert not [finding for finding in data.findings if finding.kind == "jump"]
+    assert not [finding for finding in data.findings if finding.kind == FindingKind.JUMP]
     (run,) = data.episodes
     np.testing.assert_array_equal(run.usable, ~wrong)
     np.testing.assert_array_equal(run.placed, ~wrong)
@@ -528,10 +526,10 @@ def test_a_wheel_that_turns_fast_is_unwrapped_by_its_velocity(rate):
     true, velocity = rate * time + 5 * np.sin(20 * time), rate + 100 * np.cos(20 * time)
     table = {"time": time, "qpos.wheel": np.angle(np.exp(1j * true)), "qvel.wheel": velocity}
     data = Measurements.from_tables({"a": table})
-    assert kinds(data) == ["wrapped angle"]
+    assert kinds(data) == [FindingKind.WRAPPED_ANGLE]
     np.testing.assert_allclose(data.episodes[0].qpos[:, 0], true, atol=1e-9)
     lost = Measurements.from_tables({"a": {**table, "qvel.wheel": np.zeros(200) + rate % 70}})  # which does not fit
-    assert "fast angle" in kinds(lost)
+    assert FindingKind.FAST_ANGLE in kinds(lost)
 
 
 def test_a_bad_velocity_does_not_bend_an_angle():
@@ -540,20 +538,20 @@ def test_a_bad_velocity_does_not_bend_an_angle():
     glitched["qvel.hinge"][100] = 800.0
     data = Measurements.from_tables({"a": glitched})
     np.testing.assert_array_equal(data.episodes[0].qpos[:, 0], glitched["qpos.hinge"])
-    assert "wrapped angle" not in kinds(data)
+    assert FindingKind.WRAPPED_ANGLE not in kinds(data)
     moves = np.clip(np.sin(2 * time), 0, 1)  # with pauses between, and a velocity in degrees
     velocity = 180 / np.pi * np.gradient(moves, 0.01)
     data = Measurements.from_tables({"a": {"time": time, "qpos.hinge": moves, "qvel.hinge": velocity}})
     np.testing.assert_array_equal(data.episodes[0].qpos[:, 0], moves)
-    assert kinds(data) == ["velocity slope"]
+    assert kinds(data) == [FindingKind.VELOCITY_SLOPE]
     assert "in degrees" in data.findings[0].message
 
 
 def test_a_wheel_whose_turns_cannot_be_told_is_said():
     time = np.arange(200) * 0.01
     data = Measurements.from_tables({"a": {"time": time, "qpos.wheel": np.angle(np.exp(1j * 250 * time))}})
-    assert "fast angle" in kinds(data)
-    assert "missing velocity" in kinds(data)
+    assert FindingKind.FAST_ANGLE in kinds(data)
+    assert FindingKind.MISSING_VELOCITY in kinds(data)
 
 
 def test_a_continuous_angle_is_left_alone():
@@ -565,7 +563,7 @@ def test_quantised_velocity_is_reported():
     table = swing()
     table["qvel.hinge"] = np.round(table["qvel.hinge"] / 0.25) * 0.25
     data = Measurements.from_tables({"a": table})
-    assert kinds(data) == ["quantised velocity"]
+    assert kinds(data) == [FindingKind.QUANTISED_VELOCITY]
     assert "0.25" in data.findings[0].message
     assert quantum(np.concatenate([np.zeros(500), swing()["qvel.hinge"]])) is None
     assert quantum(1.5 + 2.2e-16 * (np.arange(120) % 7)) is None  # it is constant
@@ -573,7 +571,7 @@ def test_quantised_velocity_is_reported():
 
 def test_missing_velocity_is_estimated_and_reported():
     data = Measurements.from_tables({"a": edited(qvel__hinge=None)})
-    assert kinds(data) == ["missing velocity"]
+    assert kinds(data) == [FindingKind.MISSING_VELOCITY]
     np.testing.assert_allclose(data.episodes[0].qvel[:, 0], swing()["qvel.hinge"], atol=1e-3)
 
 
@@ -600,7 +598,7 @@ def test_missing_velocities_of_a_turning_body_are_estimated(kind):
     positions[200:, -4:] *= -1  # the same orientations
     names = [f"qpos.{name}" for name in columns.qpos]
     data = Measurements.from_tables({"a": {"time": time, **dict(zip(names, positions.T))}})
-    assert set(kinds(data)) == {"missing velocity", "quaternion sign"}
+    assert set(kinds(data)) == {FindingKind.MISSING_VELOCITY, FindingKind.QUATERNION_SIGN}
     assert data.columns.missing == data.columns.qvel
     np.testing.assert_allclose(data.episodes[0].qvel, velocities, atol=0.02)
 
@@ -625,14 +623,14 @@ def test_another_convention_of_rotations_is_told(kind, last, world, said):
         values[:, turn] = np.roll(values[:, turn], -1, axis=1)
     names = [*(f"qpos.{name}" for name in columns.qpos), *(f"qvel.{name}" for name in columns.qvel)]
     data = Measurements.from_tables({"a": {"time": time, **dict(zip(names, values.T))}})
-    told = [finding.message for finding in data.findings if finding.kind == "other convention"]
+    told = [finding.message for finding in data.findings if finding.kind == FindingKind.OTHER_CONVENTION]
     assert len(told) == (said is not None)
     assert said is None or f"the numbers fit {said};" in told[0]
 
 
 @pytest.mark.parametrize("kind", ["free", "ball"])
 @pytest.mark.parametrize(
-    ("factor", "found"), [(1.0, None), (-1.0, "flipped velocity"), (180 / np.pi, "velocity slope")]
+    ("factor", "found"), [(1.0, None), (-1.0, FindingKind.FLIPPED_VELOCITY), (180 / np.pi, FindingKind.VELOCITY_SLOPE)]
 )
 def test_an_angular_velocity_against_the_quaternions_is_reported(kind, factor, found):
     columns, time, values = tumble(kind)
@@ -656,7 +654,7 @@ def test_a_right_angular_velocity_of_fast_motion_has_no_finding(rate, hertz):
         mujoco.mj_step(model, mj, 1000 // rate)
     names = ["time", *(f"qpos.root.{i}" for i in range(4)), *(f"qvel.root.{i}" for i in range(3))]
     data = Measurements.from_tables({"a": dict(zip(names, np.array(rows).T))})
-    assert not {"velocity slope", "flipped velocity"} & set(kinds(data))
+    assert not {FindingKind.VELOCITY_SLOPE, FindingKind.FLIPPED_VELOCITY} & set(kinds(data))
 
 
 def test_quaternions_are_given_norm_one():
@@ -666,7 +664,7 @@ def test_quaternions_are_given_norm_one():
         Measurements.from_tables({"a": {"time": time, **dict(zip(names, size * values[:, :4].T))}})
         for size in (1.0, 1.04)
     )
-    assert kinds(scaled) == ["quaternion norm", *kinds(exact)]
+    assert kinds(scaled) == [FindingKind.QUATERNION_NORM, *kinds(exact)]
     np.testing.assert_allclose(scaled.episodes[0].qpos, exact.episodes[0].qpos, atol=1e-12)
     np.testing.assert_allclose(scaled.episodes[0].qvel, exact.episodes[0].qvel, atol=1e-9)
 
@@ -722,7 +720,9 @@ def test_velocity_estimate_is_exact_for_constant_speed_on_a_jittered_clock():
     np.testing.assert_allclose(smoothed_velocity(time[:5], 3 * time[:5]), 3.0, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("factor", "kind"), [(-1.0, "flipped velocity"), (180 / np.pi, "velocity slope")])
+@pytest.mark.parametrize(
+    ("factor", "kind"), [(-1.0, FindingKind.FLIPPED_VELOCITY), (180 / np.pi, FindingKind.VELOCITY_SLOPE)]
+)
 def test_velocity_against_position_is_reported(factor, kind):
     table = swing()
     table["qvel.hinge"] *= factor
@@ -740,7 +740,7 @@ def test_velocity_against_position_is_reported(factor, kind):
 def test_right_but_noisy_velocities_of_gentle_motion_have_no_finding(system, setting):
     """Noise of the differentiated position is no fault of the velocity."""
     data = generate(system, [], seed=1, episodes=4, duration=3.0, noise=5e-3, **setting).measurements
-    assert not {"velocity slope", "flipped velocity"} & set(kinds(data))
+    assert not {FindingKind.VELOCITY_SLOPE, FindingKind.FLIPPED_VELOCITY} & set(kinds(data))
     slopes = [velocity_slope(e.time, e.qpos[:, j], e.qvel[:, j]) for e in data.episodes for j in range(e.qpos.shape[1])]
     np.testing.assert_allclose([s for s in slopes if s is not None], 1.0, atol=0.05)
     assert len([s for s in slopes if s is not None]) > 0.7 * len(slopes)
@@ -752,7 +752,7 @@ def test_wrong_velocities_of_noisy_motion_are_all_found(factor):
         for q, v in zip(e.qpos.T, e.qvel.T):
             slope = velocity_slope(e.time, q, factor * v)
             assert slope == pytest.approx(factor, rel=0.1)
-            assert not SLOPE[0] <= slope <= SLOPE[1]
+            assert not DATA.slope[0] <= slope <= DATA.slope[1]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3, 1.0, 1.5])
@@ -862,8 +862,13 @@ def test_simple_pendulum_loads_with_its_quantised_velocity():
     data = Measurements.from_tables(tables)
     assert sum(len(e) for e in data.episodes) == sum(len(t["time"]) for t in tables.values()) == 6340
     assert len(data.episodes) == 4
-    assert kinds(data).count("quantised velocity") == 4
-    assert not {"flipped velocity", "velocity slope", "wrapped angle", "gap"} & set(kinds(data))
+    assert kinds(data).count(FindingKind.QUANTISED_VELOCITY) == 4
+    assert not {
+        FindingKind.FLIPPED_VELOCITY,
+        FindingKind.VELOCITY_SLOPE,
+        FindingKind.WRAPPED_ANGLE,
+        FindingKind.GAP,
+    } & set(kinds(data))
 
 
 @pytest.mark.parametrize("tables", [{"time": np.arange(9.0), "qpos.hinge": np.arange(9.0)}, [1.0], "runs.csv"])
@@ -888,12 +893,12 @@ def test_held_samples_are_told_and_coarse_encoders_are_not() -> None:
         (np.round(np.sin(3 * time), 2), None),
         (0.01 * time // 1e-4, None),
     ):
-        assert signal_quality.held(position[:, None]) == found
+        assert signal_quality.rows_per_reading(position[:, None]) == found
     table = {"time": time, "qpos.hinge": held, "ctrl.motor": np.cos(time)}
-    assert "held samples" in kinds(Measurements.from_tables({"a": table}))
+    assert FindingKind.HELD_SAMPLES in kinds(Measurements.from_tables({"a": table}))
     mixed = Measurements.from_tables({"a": {**table, "qpos.elbow": motion}})  # one sensor is slower than the other
-    assert [(f.kind, f.where) for f in mixed.findings if f.kind == "held samples"] == [
-        ("held samples", "a, qpos.hinge")
+    assert [(f.kind, f.where) for f in mixed.findings if f.kind == FindingKind.HELD_SAMPLES] == [
+        (FindingKind.HELD_SAMPLES, "a, qpos.hinge")
     ]
 
 

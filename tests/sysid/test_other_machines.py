@@ -13,6 +13,7 @@ from sb3_rpto.effects import LIBRARY, Simulation, declare
 from sb3_rpto.effects.corrected_model_io import correct
 from sb3_rpto.sysid import Measurements, trace
 from sb3_rpto.sysid.data.signal_quality import align_quaternions
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.problem.data_model_consistency import check_against
 from sb3_rpto.sysid.problem.inverse_dynamics import force_residuals, summary
 from sb3_rpto.sysid.shooting.windows import discretised, is_stiff
@@ -157,7 +158,7 @@ def test_actuators_whose_state_no_column_tells_are_refused(actuator: str, messag
 )
 def test_actuators_of_a_kind_that_may_have_a_state_and_have_none_are_traced(actuator: str) -> None:
     xml = machine(actuator)
-    assert {f.kind for f in check_against(compiled(xml), steps(xml, episodes=2, samples=100))} <= {"sampling"}
+    assert {f.kind for f in check_against(compiled(xml), steps(xml, episodes=2, samples=100))} <= {FindingKind.SAMPLING}
 
 
 @pytest.mark.slow
@@ -187,9 +188,9 @@ def test_a_stiff_finger_is_integrated_implicitly_and_it_says_so() -> None:
     xml = machine('<position name="motor" joint="hinge" kp="1"/>', 'damping="0.1"', 'size=".005" mass="0.02"', 0.05)
     data = steps(xml, size=0.5)
     report = briefly(xml, data, ["hinge.damping"], candidates=[])
-    assert "stiff model" in findings(report)
+    assert FindingKind.STIFF_MODEL in findings(report)
     assert report.adequacy_before.ratio < 1.5
-    assert "stiff model" not in findings(briefly(machine(MOTOR), steps(machine(MOTOR), 4), [], candidates=[]))
+    assert FindingKind.STIFF_MODEL not in findings(briefly(machine(MOTOR), steps(machine(MOTOR), 4), [], candidates=[]))
 
 
 def test_the_fastest_rate_of_a_damped_joint_decides_whether_a_model_is_stiff() -> None:
@@ -220,7 +221,7 @@ def test_quaternions_of_one_orientation_are_given_one_sign() -> None:
     columns |= {f"qvel.ball.{i}": np.full(100, float(i == 0)) for i in range(3)}
     data = Measurements.from_tables({"a": {"time": angle, **columns}})
     np.testing.assert_allclose(data.episodes[0].qpos, smooth)
-    assert [f.kind for f in data.findings] == ["quaternion sign"]
+    assert [f.kind for f in data.findings] == [FindingKind.QUATERNION_SIGN]
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto.sysid import Measurements, trace
+from sb3_rpto.sysid.findings import FindingKind
 
 ARM = """<mujoco><compiler angle="radian" autolimits="true"/><option timestep="0.002" integrator="implicitfast">
 <flag contact="disable"/></option><worldbody><body name="upper">
@@ -51,7 +52,7 @@ def test_a_simulators_own_steps_are_met_where_they_are_shorter_than_the_models()
     mass, damping = (t.effect.values[0] for t in report.declared)
     assert mass == pytest.approx(0.66, rel=3e-3)
     assert damping == pytest.approx(0.1, rel=0.02)
-    (found,) = [f for f in report.findings if f.kind == "simulated"]
+    (found,) = [f for f in report.findings if f.kind == FindingKind.SIMULATED]
     assert "in steps of 1 ms" in found.message
 
 

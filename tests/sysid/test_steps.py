@@ -6,6 +6,7 @@ import pytest
 from simulated import briefly
 
 from sb3_rpto.sysid import Measurements, trace
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.problem.data_model_consistency import carried_weights, soft_friction, soft_ties
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 
@@ -48,7 +49,7 @@ def test_dry_friction_is_judged_with_steps_that_meet_its_kinks(rubbing: Measurem
     assert report.verdict == "explained"
     assert [t.label for t in report.effects] == ["coulomb_friction(crank)"]
     assert report.effects[0].effect.values == pytest.approx([0.25], rel=0.02)
-    assert [f.where for f in report.findings if f.kind == "time step"] == ["model"]
+    assert [f.where for f in report.findings if f.kind == FindingKind.TIME_STEP] == ["model"]
 
 
 @pytest.mark.slow
@@ -57,7 +58,7 @@ def test_a_rubbing_machine_whose_friction_is_declared_is_complete(rubbing: Measu
     declared = ["crank.damping", "crank.frictionloss"]
     report = briefly(model, rubbing, declared, candidates=["coulomb_friction"])
     assert report.verdict == "complete"
-    assert not [f for f in report.findings if f.kind == "soft friction"]
+    assert not [f for f in report.findings if f.kind == FindingKind.SOFT_FRICTION]
 
 
 def test_friction_that_creeps_is_said_to() -> None:
@@ -110,4 +111,4 @@ def test_commands_logged_after_they_acted_are_found(late: int, friction: str, sa
     model = CRANK.format(friction="")
     report = briefly(model, crank(friction, late), ["crank.damping"], candidates=["command_gain"])
     assert report.verdict not in ("complete", "explained")
-    assert [f.where for f in report.findings if f.kind == "early response"] == said
+    assert [f.where for f in report.findings if f.kind == FindingKind.EARLY_RESPONSE] == said

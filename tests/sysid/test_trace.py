@@ -24,6 +24,7 @@ from sb3_rpto.effects.forces import TorqueOffset
 from sb3_rpto.effects.friction import CoulombFriction, ViscousFriction
 from sb3_rpto.effects.library import given
 from sb3_rpto.sysid import Measurements, Report, trace
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.problem.problem import Assumptions, IdentificationProblem, Inputs, prepare
 from sb3_rpto.sysid.report.diagnostics import at_bounds
 from sb3_rpto.sysid.selection.adequacy import Adequacy, judge
@@ -113,7 +114,7 @@ def test_a_run_that_stalled_is_named_also_where_others_are_judged_on() -> None:
     still = np.random.default_rng(3).normal(0.9, 1e-3, stuck.qpos.shape)
     data.episodes[0] = replace(stuck, qpos=still, qvel=0 * stuck.qvel)
     report = traced_simply(data, kinds=["coulomb_friction"])
-    (stray,) = [f for f in report.findings if f.kind == "stray windows"]
+    (stray,) = [f for f in report.findings if f.kind == FindingKind.STRAY_WINDOWS]
     assert (stray.where, stray.runs) == ("0", ("0",))
     assert stray.message.startswith("5 of 5 windows")
     assert report.effects[0].interval[0, 0] < 0.08 < report.effects[0].interval[1, 0]
@@ -140,10 +141,10 @@ def test_a_test_run_unlike_all_others_is_told_beside_the_verdict() -> None:
     moved = [replace(e, qpos=e.qpos + 0.06) if e.run in runs else e for e in data.episodes]
     report = traced_simply(replace(data, episodes=moved))
     assert report.verdict == simple_report().verdict == "explained"
-    (found,) = [f for f in report.findings if f.kind == "missed"]
+    (found,) = [f for f in report.findings if f.kind == FindingKind.MISSED]
     assert found.runs == (*runs,)
     assert "times what noise leaves" in found.message
-    assert not [f for f in simple_report().findings if f.kind == "missed"]
+    assert not [f for f in simple_report().findings if f.kind == FindingKind.MISSED]
 
 
 @pytest.mark.slow
@@ -152,7 +153,7 @@ def test_one_test_run_of_several_that_differs_is_named_alone() -> None:
     data.episodes[-1] = replace(data.episodes[-1], qpos=data.episodes[-1].qpos + 0.03)
     report = traced_simply(data, kinds=["coulomb_friction"])
     assert report.verdict == "explained"
-    (found,) = [f for f in report.findings if f.kind == "missed"]
+    (found,) = [f for f in report.findings if f.kind == FindingKind.MISSED]
     assert found.where == data.episodes[-1].run
 
 
@@ -296,7 +297,11 @@ def test_a_split_column_is_honoured() -> None:
 
 
 def selected_on(report: Report) -> list[str]:
-    return [f.message for f in report.findings if f.kind == "split" and "windows of the training runs" in f.message]
+    return [
+        f.message
+        for f in report.findings
+        if f.kind == FindingKind.SPLIT and "windows of the training runs" in f.message
+    ]
 
 
 @pytest.mark.slow
@@ -321,7 +326,7 @@ def test_a_single_block_to_select_on_is_no_evidence_so_that_all_take_turns() -> 
 def test_a_single_run_is_traced_and_reported_as_not_held_out() -> None:
     report = traced_simply(few(1, 3.6))
     assert report.runs["test"] == []
-    assert not [f for f in report.findings if f.kind == "missed"]
+    assert not [f for f in report.findings if f.kind == FindingKind.MISSED]
     assert any("no test data" in f.message for f in report.findings)
     assert "fitted runs" in str(report)
     assert np.isfinite(report.after[0].rmse).all()
@@ -460,7 +465,7 @@ def test_of_numbers_that_only_show_together_the_last_stays_what_it_was() -> None
     assert gain.effect.values[0] == 1.0
     assert np.isnan([gear.interval, gain.interval]).all()
     assert np.isfinite(mass.interval).all()
-    said = [f.where for f in report.findings if f.kind == "undetermined"]
+    said = [f.where for f in report.findings if f.kind == FindingKind.UNDETERMINED]
     assert said == ["declared slide.gear", "declared slide.gain"]
 
 
@@ -497,9 +502,11 @@ def test_an_environment_that_does_more_than_its_model_is_told(gain: float, push:
     env = Steps()
     env.gain, env.push = gain, push
     report = trace(env, data, candidates=[], threads=1)
-    (found,) = [f for f in report.findings if f.kind == "own step"]
+    (found,) = [f for f in report.findings if f.kind == FindingKind.OWN_STEP]
     assert said in found.message
-    assert not [f for f in trace(driven(0.0)[0], data, candidates=[], threads=1).findings if f.kind == "own step"]
+    assert not [
+        f for f in trace(driven(0.0)[0], data, candidates=[], threads=1).findings if f.kind == FindingKind.OWN_STEP
+    ]
 
 
 @pytest.mark.slow
@@ -557,12 +564,12 @@ def test_declared_numbers_of_which_the_data_tell_nothing_are_named() -> None:
     still = {f"r{i}": {"time": np.arange(n) / RATE, "qpos.hinge": 1e-4 * rng.standard_normal(n)} for i in range(3)}
     data = Measurements.from_tables({name: {**t, "ctrl.motor": np.zeros(n)} for name, t in still.items()})
     report = briefly(PENDULUM, data, ["hinge.damping", "pole.mass"], candidates=[])
-    assert [f.where for f in report.findings if f.kind == "undetermined"] == [
+    assert [f.where for f in report.findings if f.kind == FindingKind.UNDETERMINED] == [
         "declared hinge.damping",
         "declared pole.mass",
     ]
     moved = briefly(PENDULUM, recorded(), ["hinge.damping", "pole.mass"], candidates=[])
-    assert "undetermined" not in {f.kind for f in moved.findings}
+    assert FindingKind.UNDETERMINED not in {f.kind for f in moved.findings}
 
 
 @pytest.mark.slow
@@ -570,10 +577,10 @@ def test_a_declared_number_that_ends_at_its_bound_is_named() -> None:
     light = COARSE.replace('mass="0.5"', 'mass="0.3"')  # where the machine has 0.5
     data = recorded(model=compiled(COARSE), rate=100)
     narrow, wide = (traced_simply(data, [], [f"pole.mass=0.2:{most}"], light) for most in (0.4, 1.0))
-    (finding,) = [f for f in narrow.findings if f.kind == "at its bound"]
+    (finding,) = [f for f in narrow.findings if f.kind == FindingKind.AT_ITS_BOUND]
     assert (finding.where, finding.message[:4]) == ("declared pole.mass", "0.4 ")
     assert "pole.mass=low:high" in finding.message
-    assert "at its bound" not in {f.kind for f in wide.findings}
+    assert FindingKind.AT_ITS_BOUND not in {f.kind for f in wide.findings}
 
 
 def test_an_effect_that_ends_at_its_bound_is_named() -> None:

@@ -10,6 +10,7 @@ from simulated import PENDULUM, recorded
 
 from benchmarks.tracing.planting import generate
 from sb3_rpto.sysid import trace
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.hypotheses.undeclared_mass import UndeclaredMass
 from sb3_rpto.sysid.problem.problem import Inputs, prepare
 from sb3_rpto.sysid.report.descriptions import VERDICTS, verdict
@@ -50,7 +51,7 @@ def test_a_mass_that_was_not_declared_is_named_with_its_size() -> None:
     others = [name for name in planted.declared if name != "pole.mass"]
     report = trace(xml, planted.measurements, others, candidates=["coulomb_friction", "payload"])
     assert report.verdict == "unexplained"
-    (hint,) = [finding for finding in report.findings if finding.kind == "undeclared mass"]
+    (hint,) = [finding for finding in report.findings if finding.kind == FindingKind.UNDECLARED_MASS]
     assert hint.where == "pole"
     assert float(hint.message.split()[1]) == pytest.approx(times, rel=0.02)
     assert "declare pole.mass" in hint.message
@@ -60,7 +61,7 @@ def test_a_mass_that_was_not_declared_is_named_with_its_size() -> None:
 def test_candidates_that_the_model_has_no_place_for_are_named() -> None:
     kinds = ["wind", "spring", "wind"]
     task = prepare(Inputs(PENDULUM, recorded(), ["hinge.damping"], candidates=kinds, horizon=0.35, threads=1))
-    assert [finding.where for finding in task.findings if finding.kind == "no place"] == ["wind"]
+    assert [finding.where for finding in task.findings if finding.kind == FindingKind.NO_PLACE] == ["wind"]
     assert [effect.kind for effect in task.fine.effects] == ["declared", "spring"]
 
 

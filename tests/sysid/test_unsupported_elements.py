@@ -8,9 +8,9 @@ import pytest
 from simulated import PENDULUM, briefly, compiled, recorded
 
 from sb3_rpto.sysid import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding, listed
+from sb3_rpto.sysid.findings import Finding, FindingKind, Hint, listed
 from sb3_rpto.sysid.problem.data_model_consistency import check_against, soft_ties
-from sb3_rpto.sysid.problem.unsupported_elements import Hint, mocap_bodies, unreached, weigh_hints
+from sb3_rpto.sysid.problem.unsupported_elements import mocap_bodies, unreached, weigh_hints
 
 LINK = '<geom type="capsule" size=".03" fromto="0 0 0 0 0 -.3" mass="1" contype="0" conaffinity="0"/>'
 HINGE = '<joint name="hinge" axis="0 1 0" damping=".05" armature=".01"/>'
@@ -133,13 +133,13 @@ def test_a_hint_is_withheld_beside_what_nothing_acts_on_unless_it_leaves_nothing
         (arm, 0.03, True),
         (None, 0.03, True),
     ):
-        hint = Hint("undeclared mass", "arm", "declare arm.mass", bodies=bodies, left=left)
+        hint = Hint(FindingKind.UNDECLARED_MASS, "arm", "declare arm.mass", bodies=bodies, left=left)
         found = weigh_hints(model, [hint], ratio=37.0)
         assert (hint in found) == told
         assert ("beyond the library" in [f.kind for f in found]) == (bodies == toy or not told)
-    other = Finding("time step", "the model", "errs less in finer steps")
+    other = Finding(FindingKind.TIME_STEP, "the model", "errs less in finer steps")
     assert other in weigh_hints(model, [other], ratio=37.0)
-    plain = Hint("undeclared mass", "pole", "declare pole.mass", bodies=frozenset({1}), left=0.36)
+    plain = Hint(FindingKind.UNDECLARED_MASS, "pole", "declare pole.mass", bodies=frozenset({1}), left=0.36)
     assert weigh_hints(compiled(), [plain], ratio=37.0) == [plain]
 
 
@@ -189,7 +189,7 @@ def test_a_complete_trace_tells_of_a_mocap_body_and_not_of_its_soft_weld() -> No
         "</mujoco>", '<equality><weld body1="hand" body2="pole"/></equality></mujoco>'
     )
     model = compiled(xml)
-    assert "mocap body" in [f.kind for f in check_against(model, recorded())]
+    assert FindingKind.MOCAP_BODY in [f.kind for f in check_against(model, recorded())]
     assert soft_ties(model) == []
     assert len(soft_ties(compiled(xml.replace(' mocap="true"', "")))) == 1
 
@@ -217,9 +217,15 @@ def test_a_ball_joint_of_other_damping_is_named_and_no_mass() -> None:
     report = briefly(model_of(ARM.format(0.05), acting(BALL_MOTORS)), ball_log(), [], ["payload"])
     assert report.verdict in ("unexplained", "partly explained")
     kinds = [f.kind for f in report.findings]
-    assert "beyond the library" in kinds
-    assert not {"undeclared mass", "undeclared inertia", "exchanged", "reversed", "early response"} & {*kinds}
-    (said,) = [f.message for f in report.findings if f.kind == "beyond the library"]
+    assert FindingKind.BEYOND_THE_LIBRARY in kinds
+    assert not {
+        FindingKind.UNDECLARED_MASS,
+        FindingKind.UNDECLARED_INERTIA,
+        FindingKind.EXCHANGED,
+        FindingKind.REVERSED,
+        FindingKind.EARLY_RESPONSE,
+    } & {*kinds}
+    (said,) = [f.message for f in report.findings if f.kind == FindingKind.BEYOND_THE_LIBRARY]
     assert "ball joint 'sh'" in said
 
 
@@ -231,7 +237,12 @@ def test_a_pole_that_a_mocap_body_holds_in_the_model_alone_is_unexplained_by_tha
     report = briefly(nominal, recorded(), ["hinge.damping"], ["coulomb_friction"])
     assert report.verdict == "unexplained"
     kinds = [f.kind for f in report.findings]
-    assert {"mocap body", "beyond the library"} <= {*kinds}
-    assert not {"soft tie", "large angle", "undeclared mass", "undeclared inertia", "reversed", "early response"} & {
-        *kinds
-    }
+    assert {FindingKind.MOCAP_BODY, FindingKind.BEYOND_THE_LIBRARY} <= {*kinds}
+    assert not {
+        FindingKind.SOFT_TIE,
+        FindingKind.LARGE_ANGLE,
+        FindingKind.UNDECLARED_MASS,
+        FindingKind.UNDECLARED_INERTIA,
+        FindingKind.REVERSED,
+        FindingKind.EARLY_RESPONSE,
+    } & {*kinds}

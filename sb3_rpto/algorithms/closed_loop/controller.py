@@ -23,6 +23,7 @@ from sb3_rpto.envs.env_copy import copy_env
 from sb3_rpto.envs.observations import single_env
 from sb3_rpto.sysid import Measurements, Report, trace
 from sb3_rpto.sysid.data.encoder_offsets import EncoderOffsets
+from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.problem.contacts import contact_changes
 from sb3_rpto.sysid.problem.problem import Progress
 from sb3_rpto.sysid.selection.adequacy import SETTLED
@@ -41,7 +42,13 @@ ROUNDING = 1e-6
 #: And, where the last one did not account for everything, when there are so many times as many transitions.
 MORE = 2
 #: Findings that say what would account for the target in place of effects.
-OTHERWISE = {"beyond the library", "time step", "early response", "exchanged", "reversed"}
+OTHERWISE = {
+    FindingKind.BEYOND_THE_LIBRARY,
+    FindingKind.TIME_STEP,
+    FindingKind.EARLY_RESPONSE,
+    FindingKind.EXCHANGED,
+    FindingKind.REVERSED,
+}
 #: Samples in a window: several steps show what acts late, and contacts do not amplify errors yet.
 WINDOW = 4
 #: What is missing grows with the square of the time, noise does not: where there is some and no contacts come and go,
@@ -312,14 +319,16 @@ class LoopCloser:
         model.dump_logs()  # SB3 waits for the end of some episodes, before which a short run is over
         if model.verbose:
             print(f"traced on {data}: {report.verdict}; {', '.join(added) or 'nothing'} added")
-        doubtful = {"undetermined"} if report.verdict == "unexplained" else {"undetermined", "at its bound"}
+        doubtful = {FindingKind.UNDETERMINED}
+        if report.verdict != "unexplained":
+            doubtful.add(FindingKind.AT_ITS_BOUND)
         doubts = [f"{f.where}: {f.message}" for f in report.findings if f.kind in doubtful]
         if doubts and model._traces_log:  # of transitions the fits say so
             warnings.warn(f"the trace on {data}: {'. '.join(doubts)}", stacklevel=3)
         if report.verdict == "unexplained":
             known = model.measured is not None or model.dynamics_kwargs.get("observation_noise") is not None
             others = "".join(f". {f.message}" for f in report.findings if f.kind in OTHERWISE)
-            bounds = "".join(f". {f.where}: {f.message}" for f in report.findings if f.kind == "at its bound")
+            bounds = "".join(f". {f.where}: {f.message}" for f in report.findings if f.kind == FindingKind.AT_ITS_BOUND)
             noise = "" if known else "whether they are noisy (dynamics_kwargs={'observation_noise': ...}), "
             warnings.warn(
                 f"the trace on {data} is 'unexplained': what it looked for does not account for the difference, and "

@@ -41,6 +41,15 @@ class Columns:
         joint = joint_of(name)
         return name == joint or (f"{joint}.6" in self.qpos and name[-1] in "012")
 
+    def quaternions(self) -> list[tuple[str, int]]:
+        """Ball and free joints, and where their quaternions begin in ``qpos``."""
+        found = []
+        for joint in dict.fromkeys(map(joint_of, self.qpos)):
+            count = sum(joint_of(name) == joint for name in self.qpos)
+            if count in (4, 7):
+                found.append((joint, self.qpos.index(f"{joint}.{count - 4}")))
+        return found
+
 
 def joint_of(name: str) -> str:
     """Joint of a coordinate: ``root`` for ``root.3``, the name itself for a scalar joint."""

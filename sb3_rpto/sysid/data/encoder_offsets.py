@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class EncoderOffsets:
             "fitted runs; those of other runs are not known, and predictions err by that much more there. Home the "
             "machine at a stop or a mark"
         )
-        return Finding("run zeros", "fitted runs, encoders", message)
+        return Finding(FindingKind.RUN_ZEROS, "fitted runs, encoders", message)
 
     def to_json(self) -> dict[str, Any]:
         """Offsets by joint and run, and the evidence for them."""

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
@@ -28,16 +27,10 @@ from sb3_rpto.envs.observations import (
 )
 from sb3_rpto.sysid.data import signal_quality
 from sb3_rpto.sysid.data.columns import Columns, columns_of, joint_of
-from sb3_rpto.sysid.data.coordinates import turning
-from sb3_rpto.sysid.data.measurements import Measurements, Noise
-from sb3_rpto.sysid.data.recording import Episode
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.data.recording import Episode, Noise
+from sb3_rpto.sysid.data.settings import DATA
+from sb3_rpto.sysid.findings import Finding, FindingKind
 
-MIN_TRANSITIONS = 2
-#: Draws from which the noise of states follows from that of observations.
-DRAWS = 10_000
-#: A speed that lies within so many standard deviations of its observation's bound may be beyond it.
-BEYOND = 4.0
 ALL = "all episodes"
 
 
@@ -49,12 +42,24 @@ class Run(NamedTuple):
     actions: np.ndarray  # (T - 1, n), as given to env.step
 
 
-def from_replay(
+class Recorded(NamedTuple):
+    """What transitions tell, field by field as in :class:`~sb3_rpto.sysid.Measurements`."""
+
+    episodes: list[Episode]
+    columns: Columns
+    findings: list[Finding]
+    unobserved: tuple[str, ...]
+    exact: bool
+    simulated: bool
+    noise: Noise | None
+
+
+def read_replay(
     buffer: ReplayBuffer,
     env: gym.Env | VecEnv,
     exact: bool = True,
     noise: float | Sequence[float] | np.ndarray | None = None,
-) -> Measurements:
+) -> Recorded:
     """See :meth:`sb3_rpto.sysid.Measurements.from_replay`."""
     env = single_env(env)
     mujoco_model(env)
@@ -84,11 +89,11 @@ def from_replay(
     findings = []
     if broken:
         message = f"{broken} time(s) a transition does not begin where one before it ended; cut there"
-        findings.append(Finding("gap", ALL, message))
+        findings.append(Finding(FindingKind.GAP, ALL, message))
     return build(runs, env, exact and noise is None, findings, noise)
 
 
-def from_minari(dataset: Any, env: gym.Env | VecEnv | None = None) -> Measurements:
+def read_minari(dataset: Any, env: gym.Env | VecEnv | None = None) -> Recorded:
     """See :meth:`sb3_rpto.sysid.Measurements.from_minari`."""
     if isinstance(dataset, str):
         try:
@@ -153,25 +158,26 @@ def chain(observations: np.ndarray, next_observations: np.ndarray, dones: np.nda
 
 def build(
     runs: Sequence[Run], env: gym.Env, exact: bool, findings: list[Finding], noise: np.ndarray | None = None
-) -> Measurements:
-    """Turn observations into states and actions into commands; see :meth:`Measurements.from_replay`.
+) -> Recorded:
+    """Turn observations into states and actions into commands; see :func:`read_replay`.
 
     :param runs: observations and actions
     :param env: whose observations they are
-    :param exact: as in :class:`Measurements`
+    :param exact: whether the samples come from a simulator
     :param findings: what was found so far, is added to
     :param noise: standard deviation of each observation's, (d,); None: not known
     """
     model, recover = mujoco_model(env), state_map(env)
     columns, dt = columns_of(model), float(env.unwrapped.dt)  # type: ignore[attr-defined]
-    kept = [run for run in runs if len(run.actions) >= MIN_TRANSITIONS]
+    kept = [run for run in runs if len(run.actions) >= DATA.min_transitions]
     if not kept:
         raise ValueError(
-            f"{len(runs)} episode(s) of {env_name(env)}, none with {MIN_TRANSITIONS} transitions; record longer ones"
+            f"{len(runs)} episode(s) of {env_name(env)}, none with {DATA.min_transitions} transitions; record longer "
+            "ones"
         )
     if len(kept) < len(runs):
-        message = f"{len(runs) - len(kept)} of {len(runs)} with fewer than {MIN_TRANSITIONS} transitions; dropped"
-        findings.append(Finding("short", ALL, message))
+        message = f"{len(runs) - len(kept)} of {len(runs)} with fewer than {DATA.min_transitions} transitions; dropped"
+        findings.append(Finding(FindingKind.SHORT, ALL, message))
     for run in kept:
         if not (np.isfinite(run.observations).all() and np.isfinite(run.actions).all()):
             raise ValueError(f"episode {run.name} of {env_name(env)} has NaN or infinite values; remove it")
@@ -180,7 +186,7 @@ def build(
     states = recover(observations)
     known_noise = None
     if noise is not None:
-        states, known_noise = behind_noise(model, recover, observations, noise)
+        states, known_noise = _behind_noise(columns, recover, observations, noise)
     repairs = _Repairs(columns, states, env_name(env))
     placed = np.asarray(states.known_qpos[:, repairs.seen_qpos].all(axis=1))
     known = placed & states.known_qvel[:, repairs.seen_qvel].all(axis=1)
@@ -211,9 +217,9 @@ def build(
             if flags[:, i].any() and not flags[:, i].all():
                 unusable = "which are not compared" if prefix == "qpos" else "where no prediction begins"
                 message = f"unknown in {(~flags[:, i]).sum()} of {len(flags)} samples, {unusable}"
-                findings.append(Finding("clipped", f"{ALL}, {prefix}.{name}", message))
+                findings.append(Finding(FindingKind.CLIPPED, f"{ALL}, {prefix}.{name}", message))
     columns = replace(columns, missing=repairs.missing)
-    return Measurements(
+    return Recorded(
         episodes,
         columns,
         findings + repairs.findings(),
@@ -224,22 +230,22 @@ def build(
     )
 
 
-def behind_noise(
-    model: mujoco.MjModel, recover: StateMap, observations: np.ndarray, noise: np.ndarray
+def _behind_noise(
+    columns: Columns, recover: StateMap, observations: np.ndarray, noise: np.ndarray
 ) -> tuple[States, Noise]:
     """States behind noisy observations, and their noise by draws of it: none where no observation tells of one.
 
     A speed at its bound shows as one beside it: what could be beyond is not known.
 
-    :param model: whose quaternions are of unit length
+    :param columns: whose quaternions are of unit length
     :param recover: states from observations
     :param observations: (n, d)
     :param noise: standard deviation of each, (d,)
     """
-    rows = np.resize(np.arange(len(observations)), DRAWS)
-    shaken = noise * np.random.default_rng(0).standard_normal((DRAWS, len(noise)))
-    states, drawn = (_of_unit_length(model, recover(o)) for o in (observations, observations[rows] + shaken))
-    for far in (-BEYOND, BEYOND):
+    rows = np.resize(np.arange(len(observations)), DATA.noise_draws)
+    shaken = noise * np.random.default_rng(0).standard_normal((DATA.noise_draws, len(noise)))
+    states, drawn = (_of_unit_length(columns, recover(o)) for o in (observations, observations[rows] + shaken))
+    for far in (-DATA.bound_margin, DATA.bound_margin):
         away = recover(observations + far * noise)
         states = states._replace(
             known_qpos=states.known_qpos & away.known_qpos, known_qvel=states.known_qvel & away.known_qvel
@@ -250,12 +256,11 @@ def behind_noise(
     return states, Noise(_scatter(turns, both[0]), _scatter(drawn.qvel - states.qvel[rows], both[1]))
 
 
-def _of_unit_length(model: mujoco.MjModel, states: States) -> States:
+def _of_unit_length(columns: Columns, states: States) -> States:
     """The states with the quaternions of their ball and free joints of length one."""
     qpos = states.qpos.copy()
-    for address in turning(model):
-        columns = slice(address, address + 4)
-        qpos[:, columns] /= np.linalg.norm(qpos[:, columns], axis=1, keepdims=True)
+    for _, first in columns.quaternions():
+        qpos[:, first : first + 4] /= np.linalg.norm(qpos[:, first : first + 4], axis=1, keepdims=True)
     return states._replace(qpos=qpos)
 
 
@@ -276,7 +281,7 @@ def _commands(actions: np.ndarray, env: gym.Env, findings: list[Finding]) -> np.
         else:
             # It may be the very effect that is looked for, and have a state or a random stream of its own.
             message = f"{type(layer).__name__} is taken as part of the machine: commands are what it receives"
-            findings.append(Finding("wrapper", ALL, message))
+            findings.append(Finding(FindingKind.WRAPPER, ALL, message))
     if actions.shape != (len(actions), model.nu):
         raise ValueError(
             f"{env_name(env)}: actions have shape (n, {actions.shape[1:]}), the model {model.nu} actuators; "
@@ -322,7 +327,7 @@ class _Repairs:
             i, position = c.qvel.index(name), qpos[:, c.qpos.index(name)]
             if np.isnan(position).any():
                 raise ValueError(f"episode {episode}: neither position nor velocity of {name} is observed; observe one")
-            enough = len(time) >= signal_quality.MIN_ROWS
+            enough = len(time) >= DATA.min_rows
             qvel[:, i] = signal_quality.smoothed_velocity(time, position) if enough else np.gradient(position, time)
         for name in self.unobserved:
             i = c.qpos.index(name)
@@ -347,14 +352,14 @@ class _Repairs:
         found = []
         for name in self.unobserved:
             done = "integrated from its velocity" if name in self.integrated else "known only roughly"
-            found.append(Finding("unobserved", f"{ALL}, qpos.{name}", f"not observed; {done}, not compared"))
+            found.append(Finding(FindingKind.UNOBSERVED, f"{ALL}, qpos.{name}", f"not observed; {done}, not compared"))
         for name in self.missing:
             message = "not observed; estimated from the position by a cubic Savitzky-Golay filter"
-            found.append(Finding("missing velocity", f"{ALL}, qvel.{name}", message))
+            found.append(Finding(FindingKind.MISSING_VELOCITY, f"{ALL}, qvel.{name}", message))
         for name, count in self.turns.items():
             if count:
                 message = f"{count} turn(s) that the observation lost; recovered by means of the velocity"
-                found.append(Finding("wrapped angle", f"{ALL}, qpos.{name}", message))
+                found.append(Finding(FindingKind.WRAPPED_ANGLE, f"{ALL}, qpos.{name}", message))
         return found
 
 

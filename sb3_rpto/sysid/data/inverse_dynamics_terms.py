@@ -5,29 +5,28 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from sb3_rpto.sysid.data.signal_quality import WINDOW, smoothed_velocity
+from sb3_rpto.sysid.data.settings import DATA
+from sb3_rpto.sysid.data.signal_quality import smoothed_velocity
 
 _LIMIT = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)  # the first of limits and contacts
-#: Time that the filter of noisy recordings spans, in s.
-SMOOTHING = 0.06
 
 
-def window_of(step: float, exact: bool) -> int:
+def filter_length(step: float, exact: bool) -> int:
     """Samples of the filter that differentiates recordings.
 
     :param step: between two of them, in s
     :param exact: whether they are without noise
     """
-    return 5 if exact else int(np.clip(SMOOTHING / step, WINDOW, 101)) // 2 * 2 + 1
+    return 5 if exact else int(np.clip(DATA.filter_time / step, DATA.filter_rows, 101)) // 2 * 2 + 1
 
 
-def through(time: np.ndarray, force: np.ndarray, window: int) -> np.ndarray:
+def filtered_force(time: np.ndarray, force: np.ndarray, window: int) -> np.ndarray:
     """A force as the filter of the acceleration shows it: held from sample to sample, integrated, differentiated."""
     impulse = np.concatenate([[0.0], np.cumsum(force[:-1] * np.diff(time))])
     return smoothed_velocity(time, impulse, window)
 
 
-def inverse(
+def required_forces(
     model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, qacc: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Forces that a motion needs beyond the model's passive ones, (T, nv), and where no contact or limit acts, (T,)."""
@@ -42,7 +41,7 @@ def inverse(
     return forces, free
 
 
-def actuation(
+def actuator_forces(
     model: mujoco.MjModel, time: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray
 ) -> np.ndarray:
     """Generalised forces of the model's actuators along a given motion, (T, nv)."""

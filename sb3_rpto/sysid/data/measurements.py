@@ -7,35 +7,21 @@ import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_rpto.sysid.data import signal_quality
 from sb3_rpto.sysid.data.columns import Columns, joint_of, read_columns
-from sb3_rpto.sysid.data.recording import PARTS, Episode, Table, check_clocks, read_run, repair, runs_of
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.data.from_transitions import read_minari, read_replay
+from sb3_rpto.sysid.data.recording import PARTS, Episode, Noise, Table, check_clocks, read_run, repair, runs_of
+from sb3_rpto.sysid.data.settings import DATA
 from sb3_rpto.sysid.data.text_tables import read_text, renamed
-
-if TYPE_CHECKING:
-    import gymnasium as gym
-    from stable_baselines3.common.buffers import ReplayBuffer
-    from stable_baselines3.common.vec_env import VecEnv
+from sb3_rpto.sysid.findings import Finding, FindingKind, grouped
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
-#: A split is drawn so often before the shortest runs are set apart.
-DRAWS = 100
-
-
-class Noise(NamedTuple):
-    """Standard deviations of the white noise of whole states, where they are known.
-
-    :param qpos: of each position column in rad or m, (m,)
-    :param qvel: of each velocity column in rad/s or m/s, (nv,)
-    """
-
-    qpos: np.ndarray
-    qvel: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +82,7 @@ class Measurements:
 
     def __str__(self) -> str:
         """That line, and what was found, each kind once."""
-        return "\n".join([repr(self), *(f"  {finding}" for finding in signal_quality.grouped(self.findings))])
+        return "\n".join([repr(self), *(f"  {finding}" for finding in grouped(self.findings))])
 
     @classmethod
     def from_csv(cls, paths: Paths, rename: Mapping[str, str] | None = None) -> "Measurements":
@@ -113,7 +99,7 @@ class Measurements:
             UTF-8, units of others, a name in ``rename`` that a file does not have, or data that break the file format
             (see :meth:`from_tables`)
         """
-        return cls.from_tables({path: read_text(path, rename) for path in _expand(paths)})
+        return cls.from_tables({path: read_text(path, rename) for path in _expand_paths(paths)})
 
     @classmethod
     def from_parquet(cls, paths: Paths, rename: Mapping[str, str] | None = None) -> "Measurements":
@@ -131,7 +117,7 @@ class Measurements:
             message = "reading Parquet needs pandas and pyarrow: pip install -e '.[experiments,data]' in the checkout"
             raise ImportError(message) from error
         tables = {}
-        for path in _expand(paths):
+        for path in _expand_paths(paths):
             try:
                 frame = pandas.read_parquet(path)
             except (ValueError, OSError) as error:  # pyarrow's own of broken files are such
@@ -154,7 +140,7 @@ class Measurements:
             format (see :meth:`from_tables`)
         """
         tables = {}
-        for path in _expand(paths):
+        for path in _expand_paths(paths):
             try:
                 with np.load(path, allow_pickle=False) as archive:
                     tables[path] = {name: archive[name] for name in archive.files}
@@ -210,23 +196,22 @@ class Measurements:
                 content += (run.time - run.time[0]).round(9).tobytes()
                 if content in seen:
                     message = f"the same samples as episode {seen[content]!r}; only that one is kept"
-                    findings.append(Finding.of_run("duplicate", name, "", message))
+                    findings.append(Finding.of_run(FindingKind.DUPLICATE, name, "", message))
                     continue
                 seen[content] = name
                 episodes += repair(run, columns, findings)
         check_clocks(episodes)
         if not episodes:
             raise ValueError(
-                f"{first}: no stretch between gaps has {signal_quality.MIN_ROWS} rows; "
-                "record longer or drop fewer samples"
+                f"{first}: no stretch between gaps has {DATA.min_rows} rows; record longer or drop fewer samples"
             )
         return cls(episodes, columns, findings)
 
     @classmethod
     def from_replay(
         cls,
-        buffer: "ReplayBuffer",
-        env: "gym.Env | VecEnv",
+        buffer: ReplayBuffer,
+        env: gym.Env | VecEnv,
         *,
         exact: bool = True,
         noise: float | Sequence[float] | np.ndarray | None = None,
@@ -251,12 +236,10 @@ class Measurements:
             actuators', states that cannot be recovered, NaN, no episode of two transitions, a noise that is negative
             or of another length than the observations
         """
-        from sb3_rpto.sysid.data.from_transitions import from_replay
-
-        return from_replay(buffer, env, exact, noise)
+        return cls(**read_replay(buffer, env, exact, noise)._asdict())
 
     @classmethod
-    def from_minari(cls, dataset: Any, env: "gym.Env | VecEnv | None" = None) -> "Measurements":
+    def from_minari(cls, dataset: Any, env: gym.Env | VecEnv | None = None) -> "Measurements":
         """Read a Minari dataset of a MuJoCo environment, as :meth:`from_replay` does; its samples count as exact.
 
         :param dataset: a ``minari.MinariDataset``, or the id of one that is stored locally
@@ -265,9 +248,7 @@ class Measurements:
         :raises ImportError: minari is not installed
         :raises ValueError: as there, or observations and actions that are no arrays
         """
-        from sb3_rpto.sysid.data.from_transitions import from_minari
-
-        return from_minari(dataset, env)
+        return cls(**read_minari(dataset, env)._asdict())
 
     def tables(self) -> dict[str, np.ndarray]:
         """All samples as one table of columns of shape (sum of T,), in the file format and its units, for any writer.
@@ -328,54 +309,52 @@ class Measurements:
             raise ValueError(
                 f"fractions must be three numbers >= 0 that sum to 1, the first > 0; got {tuple(fractions)}"
             )
-        findings = list(self.findings)
+        said: list[str] = []
         if self.episodes and self.episodes[0].part is not None:
             part = {e.run: str(e.part) for e in self.episodes}
             for name in PARTS:
                 if name not in part.values():
                     if name == "train":
                         raise ValueError("no episode has 'train' in the column 'split'; name at least one")
-                    findings.append(Finding("split", "all episodes", f"the column 'split' names no {name} episode"))
+                    said.append(f"the column 'split' names no {name} episode")
         else:
             runs = sorted({e.run for e in self.episodes})
             n = len(runs)
             n_test = min(max(1, round(fractions[2] * n)), n - 1) if n >= 2 else 0
             n_select = min(round(fractions[1] * n), n - n_test)
             if n_test == 0:
-                findings.append(
-                    Finding("split", "all episodes", "there is but one run: no test data, errors cannot be held out")
-                )
+                said.append("there is but one run: no test data, errors cannot be held out")
             if n - n_test - n_select < 3:
                 n_select = 0
-                message = (
+                said.append(
                     f"{n - n_test} run(s) remain for training: none is set apart to select on, "
                     "use blocks of the training runs"
                 )
-                findings.append(Finding("split", "all episodes", message))
             lengths = {r: sum(len(e.time) for e in self.episodes if e.run == r) for r in runs}
-            order = _drawn(lengths, n_test + n_select, seed)
+            order = _draw_order(lengths, n_test + n_select, seed)
             part = {
                 r: "test" if i < n_test else "select" if i < n_test + n_select else "train" for i, r in enumerate(order)
             }
+        findings = [*self.findings, *(Finding(FindingKind.SPLIT, "all episodes", message) for message in said)]
         train, select, test = ([e for e in self.episodes if part[e.run] == name] for name in PARTS)
         return tuple(replace(self, episodes=e, findings=list(findings)) for e in (train, select, test))  # type: ignore[return-value]
 
 
-def _drawn(lengths: dict[str, int], apart: int, seed: int) -> list[str]:
+def _draw_order(lengths: dict[str, int], apart: int, seed: int) -> list[str]:
     """Runs in an order drawn by seed, whose first ``apart`` leave the others at least half the samples due to them.
 
     :param lengths: number of samples of each run
     """
     runs, rng = list(lengths), np.random.default_rng(seed)
     due = sum(lengths.values()) * (1 - apart / len(runs))
-    for _ in range(DRAWS):
+    for _ in range(DATA.split_draws):
         order = [runs[i] for i in rng.permutation(len(runs))]
         if sum(lengths[r] for r in order[apart:]) >= due / 2:
             return order
     return sorted(runs, key=lambda r: lengths[r])
 
 
-def _expand(paths: Paths) -> list[str]:
+def _expand_paths(paths: Paths) -> list[str]:
     if isinstance(paths, Mapping) or hasattr(paths, "columns"):
         raise TypeError("paths must name files; for a table in memory use Measurements.from_tables({'run': table})")
     patterns = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)

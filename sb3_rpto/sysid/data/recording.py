@@ -2,27 +2,30 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sb3_rpto.sysid.data import signal_quality
 from sb3_rpto.sysid.data.columns import Columns, joint_of
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.data.settings import DATA
+from sb3_rpto.sysid.findings import Finding, FindingKind
 
 Table = Mapping[str, np.ndarray]
 PARTS = ("train", "select", "test")
-#: Runs whose samples are so many times as far apart as others' have times in another unit.
-OTHER_UNIT = 100.0
 #: Degrees in a radian.
 DEGREES = 180 / np.pi
-#: Times in s should be told as finely as this.
-FINEST = 1e-10
-#: A clock comes in bursts where more than this share of the steps are gaps, and the mean is so many times the median.
-BURSTS, BURST = 0.1, 3.0
-#: Norms of quaternions may be off by so much.
-UNIT = 0.05
-#: Norms of quaternions are 1 but for rounding up to the first, and said to be off from the second on.
-ROUNDED, WORTH_SAYING = 1e-6, 1e-3
+
+
+class Noise(NamedTuple):
+    """Standard deviations of the white noise of whole states, where they are known.
+
+    :param qpos: of each position column in rad or m, (m,)
+    :param qvel: of each velocity column in rad/s or m/s, (nv,)
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,10 +147,8 @@ def read_run(file: str, name: str, rows: dict[str, np.ndarray], columns: Columns
     """Check one run and stack its columns; velocities without a column stay NaN until the gaps are known."""
     where = f"{file}, episode {name}"
     time = rows["time"]
-    if len(time) < signal_quality.MIN_ROWS:
-        raise ValueError(
-            f"{where}: {len(time)} rows are too few; give at least {signal_quality.MIN_ROWS} or remove the episode"
-        )
+    if len(time) < DATA.min_rows:
+        raise ValueError(f"{where}: {len(time)} rows are too few; give at least {DATA.min_rows} or remove the episode")
     back = np.flatnonzero(np.diff(time) <= 0)
     if len(back):
         raise ValueError(
@@ -156,7 +157,7 @@ def read_run(file: str, name: str, rows: dict[str, np.ndarray], columns: Columns
         )
     steps = np.diff(time)
     middle, mean = float(np.median(steps)), float(np.mean(steps))
-    if np.mean(steps > signal_quality.GAP * middle) > BURSTS and mean > BURST * middle:
+    if np.mean(steps > DATA.gap * middle) > DATA.burst_share and mean > DATA.burst_ratio * middle:
         raise ValueError(
             f"{where}: the clock comes in bursts, of steps of {middle:.3g} s where the mean is {mean:.3g} s; give the "
             "times at which samples were taken, not those at which they arrived"
@@ -182,7 +183,7 @@ def read_run(file: str, name: str, rows: dict[str, np.ndarray], columns: Columns
         name=name,
         run=name,
         # From 0 where, as beside the seconds since 1970, a double has no room for the tolerances of a clock.
-        time=time - time[0] if np.spacing(np.abs(time).max()) > FINEST else time,
+        time=time - time[0] if np.spacing(np.abs(time).max()) > DATA.finest_time else time,
         qpos=stack("qpos", columns.qpos, np.nan),
         qvel=stack("qvel", columns.qvel, np.nan),
         ctrl=stack("ctrl", columns.ctrl, 0.0),
@@ -201,7 +202,7 @@ def check_clocks(episodes: Sequence[Episode]) -> None:
     steps = [float(np.median(np.diff(e.time))) for e in episodes]
     usual = sorted(steps)[(len(steps) - 1) // 2] if steps else 0.0
     for episode, step in zip(episodes, steps):
-        if not usual / OTHER_UNIT < step < usual * OTHER_UNIT:
+        if not usual / DATA.clock_ratio < step < usual * DATA.clock_ratio:
             raise ValueError(
                 f"{episode.name}: the median step of column 'time' is {step:g}, that of most episodes {usual:g}; give "
                 "the times of all in seconds"
@@ -216,123 +217,116 @@ def repair(run: Episode, columns: Columns, findings: list[Finding]) -> list[Epis
         message = (
             f"{len(slices) - 1} gap(s) in time, the longest {longest:.4g} s; split there into {len(slices)} episodes"
         )
-        findings.append(Finding.of_run("gap", run.name, "", message))
+        findings.append(Finding.of_run(FindingKind.GAP, run.name, "", message))
     pieces = []
     for i, rows in enumerate(slices):
         name = run.name if len(slices) == 1 else f"{run.name}/{i}"
-        if rows.stop - rows.start < signal_quality.MIN_ROWS:
+        if rows.stop - rows.start < DATA.min_rows:
             message = f"{rows.stop - rows.start} row(s) between gaps are too few to use; set aside"
-            findings.append(Finding.of_run("short", name, "", message))
+            findings.append(Finding.of_run(FindingKind.SHORT, name, "", message))
             continue
         pieces.append(replace(run.part_of(rows, after_gap=i > 0), name=name))
-        _channels(pieces[-1], columns, findings)
+        _repair_channels(pieces[-1], columns, findings)
     return pieces
 
 
-def _quaternions(columns: Columns) -> list[tuple[str, int]]:
-    """Ball and free joints, and where their quaternions begin among the position columns."""
-    found = []
-    for joint in dict.fromkeys(map(joint_of, columns.qpos)):
-        count = sum(joint_of(name) == joint for name in columns.qpos)
-        if count in (4, 7):
-            found.append((joint, columns.qpos.index(f"{joint}.{count - 4}")))
-    return found
-
-
-class _Tell:
+class _Reporter:
     """Findings about one episode."""
 
     def __init__(self, episode: Episode, findings: list[Finding]) -> None:
         self._name, self._findings = episode.name, findings
 
-    def __call__(self, kind: str, message: str, column: str = "time") -> None:
+    def __call__(self, kind: FindingKind, message: str, column: str = "time") -> None:
         self._findings.append(Finding.of_run(kind, self._name, column, message))
 
     def slope(self, slope: float | None, column: str) -> None:
         """Of measured velocities against the positions' change, where it is not about 1."""
-        if slope is None or signal_quality.SLOPE[0] <= slope <= signal_quality.SLOPE[1]:
+        low, high = DATA.slope
+        if slope is None or low <= slope <= high:
             return
-        kind, cause = "velocity slope", "check units and filters"
+        kind, cause = FindingKind.VELOCITY_SLOPE, "check units and filters"
         if slope < 0:
-            kind, cause = "flipped velocity", "its sign is flipped"
-        elif any(
-            signal_quality.SLOPE[0] <= slope / factor <= signal_quality.SLOPE[1] for factor in (DEGREES, 1 / DEGREES)
-        ):
+            kind, cause = FindingKind.FLIPPED_VELOCITY, "its sign is flipped"
+        elif any(low <= slope / factor <= high for factor in (DEGREES, 1 / DEGREES)):
             cause = "one of the two is in degrees, times are in minutes or speeds in rpm; give s, rad and rad/s"
         self(kind, f"slope against the position's change is {slope:.2f}, not 1: {cause}; kept as it is", column)
 
 
-def _channels(episode: Episode, columns: Columns, findings: list[Finding]) -> None:
+def _repair_channels(episode: Episode, columns: Columns, findings: list[Finding]) -> None:
     """Check and repair, in place, the channels of an episode that is not yet handed out."""
-    tell = _Tell(episode, findings)
-    _look_at_samples(episode, columns, tell)
+    tell = _Reporter(episode, findings)
+    _check_samples(episode, columns, tell)
     _repair_orientations(episode, columns, tell)
     _repair_positions(episode, columns, tell)
     _complete_velocities(episode, columns, tell)
 
 
-def _look_at_samples(episode: Episode, columns: Columns, tell: _Tell) -> None:
+def _check_samples(episode: Episode, columns: Columns, tell: _Reporter) -> None:
     spread = signal_quality.jitter(episode.time)
-    if spread > signal_quality.JITTER:
+    if spread > DATA.jitter:
         tell(
-            "jitter",
+            FindingKind.JITTER,
             f"steps vary by {spread:.0%} around their median of {np.median(np.diff(episode.time)):.4g} s; kept as they "
             "are: where the logger, not the robot, was late, give the times at which the samples were taken",
         )
-    elif late := signal_quality.missing(episode.time):
+    elif late := signal_quality.count_missing_rows(episode.time):
         tell(
-            "missing rows",
+            FindingKind.MISSING_ROWS,
             f"{late} step(s) are longer than the others, and no gaps: the command of a row that is missing is not "
             "known, and the one before is held instead. Keep such rows with their commands, and interpolate the rest",
         )
-    rows = signal_quality.held(episode.qpos)
+    rows = signal_quality.rows_per_reading(episode.qpos)
     if rows is not None:
         tell(
-            "held samples",
+            FindingKind.HELD_SAMPLES,
             f"positions are fresh in every {rows}. row alone, and repeated between: keep those rows, as held ones look "
             "like late sensors and commands",
             "qpos",
         )
         return
     for i, name in enumerate(columns.qpos):
-        rows = signal_quality.held(episode.qpos[:, i : i + 1])
+        rows = signal_quality.rows_per_reading(episode.qpos[:, i : i + 1])
         if rows is not None:
             tell(
-                "held samples",
+                FindingKind.HELD_SAMPLES,
                 f"it is fresh in every {rows}. row alone, and repeated between: interpolate it between those rows, or "
                 "keep them alone, as what is held looks like a late sensor",
                 f"qpos.{name}",
             )
 
 
-def _repair_orientations(episode: Episode, columns: Columns, tell: _Tell) -> None:
+def _repair_orientations(episode: Episode, columns: Columns, tell: _Reporter) -> None:
     """Unit quaternions of one sign, and their velocities compared with how they turn."""
-    for joint, first in _quaternions(columns):
+    for joint, first in columns.quaternions():
         norms = np.linalg.norm(episode.qpos[:, first : first + 4], axis=1)
         off = float(np.nanmax(np.abs(norms - 1), initial=0.0))
-        if off > UNIT:
+        if off > DATA.quaternion_norm:
             raise ValueError(
                 f"{episode.name}: qpos.{joint} holds no unit quaternion in its last four columns (norms from "
                 f"{np.nanmin(norms):.3g} to {np.nanmax(norms):.3g}); give w, x, y, z in this order"
             )
-        if off > ROUNDED:
+        if off > DATA.quaternion_rounding:
             episode.qpos[:, first : first + 4] /= norms[:, None]
-            if off > WORTH_SAYING:
-                tell("quaternion norm", f"off 1 by up to {off:.2g}; divided by it", f"qpos.{joint}")
+            if off > DATA.quaternion_finding:
+                tell(FindingKind.QUATERNION_NORM, f"off 1 by up to {off:.2g}; divided by it", f"qpos.{joint}")
         flips = signal_quality.align_quaternions(episode.qpos[:, first : first + 4])
         if flips:
-            tell("quaternion sign", f"{flips} change(s) between q and -q, one orientation; aligned", f"qpos.{joint}")
+            tell(
+                FindingKind.QUATERNION_SIGN,
+                f"{flips} change(s) between q and -q, one orientation; aligned",
+                f"qpos.{joint}",
+            )
         turn = [i for i, name in enumerate(columns.qvel) if joint_of(name) == joint and name not in columns.missing]
         measured, oriented = episode.qvel[:, turn[-3:]], episode.qpos[:, first : first + 4]
         other = signal_quality.turning_convention(episode.time, oriented, measured) if turn else None
         if other is not None:
             message = f"the numbers fit {other}; kept as they are: give w, x, y, z, and velocities in the body's frame"
-            tell("other convention", message, f"qpos.{joint}")
+            tell(FindingKind.OTHER_CONVENTION, message, f"qpos.{joint}")
         elif turn:
             tell.slope(signal_quality.turning_slope(episode.time, oriented, measured), f"qvel.{joint}")
 
 
-def _repair_positions(episode: Episode, columns: Columns, tell: _Tell) -> None:
+def _repair_positions(episode: Episode, columns: Columns, tell: _Reporter) -> None:
     """Unwrap angles, bridge what is no reading, and tell of steps that are no motion."""
     for i, name in enumerate(columns.qpos):
         # A turn means nothing to the coordinates of a ball or free joint.
@@ -344,10 +338,10 @@ def _repair_positions(episode: Episode, columns: Columns, tell: _Tell) -> None:
             change = np.diff(episode.time) * 0.5 * (velocity[1:] + velocity[:-1])
         episode.qpos[:, i], jumps, fast = signal_quality.unwrap(episode.qpos[:, i], change)
         if jumps:
-            tell("wrapped angle", f"{jumps} jump(s) of about one turn; unwrapped", f"qpos.{name}")
+            tell(FindingKind.WRAPPED_ANGLE, f"{jumps} jump(s) of about one turn; unwrapped", f"qpos.{name}")
         if fast:
             message = "many steps are of about half a turn, so whole turns may be lost: sample faster, or give qvel"
-            tell("fast angle", message, f"qpos.{name}")
+            tell(FindingKind.FAST_ANGLE, message, f"qpos.{name}")
         _bridge_glitches(episode, i, tell, f"qpos.{name}")
         leaps = np.abs(np.diff(episode.qpos[:, i])[signal_quality.jumps(episode.time, episode.qpos[:, i])])
         if len(leaps):
@@ -357,10 +351,10 @@ def _repair_positions(episode: Episode, columns: Columns, tell: _Tell) -> None:
                 f"{len(leaps)} step(s) of {sizes} from a sample to the next, far faster than all others; kept: unwrap "
                 "the encoder at its own period, or split the run where it was moved by hand or set anew"
             )
-            tell("jump", message, f"qpos.{name}")
+            tell(FindingKind.JUMP, message, f"qpos.{name}")
 
 
-def _bridge_glitches(episode: Episode, column: int, tell: _Tell, where: str) -> None:
+def _bridge_glitches(episode: Episode, column: int, tell: _Reporter, where: str) -> None:
     """Interpolate samples of a position that are no readings, so that no velocity is made of them; none is compared.
 
     What may be motion is kept: many such samples, and those that may answer to a command, with all beside them.
@@ -374,7 +368,7 @@ def _bridge_glitches(episode: Episode, column: int, tell: _Tell, where: str) -> 
         wrong[together] = not answering[together].any()
     if not wrong.any():
         return
-    first, few = int(np.argmax(wrong)), wrong.mean() <= signal_quality.SEVERAL
+    first, few = int(np.argmax(wrong)), wrong.mean() <= DATA.glitch_share
     message = (
         f"{wrong.sum()} sample(s) far from those before and after, the first {position[first]:.4g} at "
         f"{episode.time[first]:.4g} s; "
@@ -384,7 +378,7 @@ def _bridge_glitches(episode: Episode, column: int, tell: _Tell, where: str) -> 
         if few
         else "kept, as they are many: where they are no readings, interpolate them, or drop them with their commands"
     )
-    tell("glitch", message, where)
+    tell(FindingKind.GLITCH, message, where)
     if not few:
         return
     position[wrong] = np.interp(episode.time[wrong], episode.time[~wrong], position[~wrong])
@@ -392,9 +386,9 @@ def _bridge_glitches(episode: Episode, column: int, tell: _Tell, where: str) -> 
         known[wrong] = False
 
 
-def _complete_velocities(episode: Episode, columns: Columns, tell: _Tell) -> None:
+def _complete_velocities(episode: Episode, columns: Columns, tell: _Reporter) -> None:
     """Estimate those that were not measured; look at the others' steps and slopes."""
-    turning = {joint: episode.qpos[:, first : first + 4] for joint, first in _quaternions(columns)}
+    turning = {joint: episode.qpos[:, first : first + 4] for joint, first in columns.quaternions()}
     for i, name in enumerate(columns.qvel):
         velocity = episode.qvel[:, i]
         position = episode.qpos[:, columns.qpos.index(name)] if columns.slides(name) else None
@@ -405,7 +399,7 @@ def _complete_velocities(episode: Episode, columns: Columns, tell: _Tell) -> Non
                 rates = signal_quality.angular_velocity(episode.time, turning[joint_of(name)])
                 episode.qvel[:, i] = rates[:, int(name[-1]) % 3]  # .0 to .2 of a ball joint, .3 to .5 of a free one
             tell(
-                "missing velocity",
+                FindingKind.MISSING_VELOCITY,
                 "not measured; estimated from the position by a cubic Savitzky-Golay filter",
                 f"qvel.{name}",
             )
@@ -414,7 +408,7 @@ def _complete_velocities(episode: Episode, columns: Columns, tell: _Tell) -> Non
         if step is not None:
             levels = len(np.unique(velocity))
             tell(
-                "quantised velocity",
+                FindingKind.QUANTISED_VELOCITY,
                 f"{levels} distinct values in {len(velocity)} samples, smallest step {step:.4g}",
                 f"qvel.{name}",
             )

@@ -1,128 +1,16 @@
 """What can be wrong with one recorded run: pure functions on arrays, each of which repairs or reports one thing."""
 
-import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Self
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
-MIN_ROWS = 5
-"""Fewest samples of a run: a cubic needs four points, one more leaves something to smooth."""
-GAP = 5.0
-"""A step in time longer than this many median steps is a gap."""
-SKIPPED = 1.5
-"""Where a clock is regular, a sample is missing in a step of more than so many median steps."""
-JITTER = 0.05
-"""Time is called jittered when 5 % of the steps are off the median by more than this fraction of it."""
-FEWEST_READINGS, FEWEST_STEPS = 20, 5
-"""Readings that tell whether positions are held between them; different changes that no coarse encoder makes."""
-SLOPE = (0.8, 1.25)
-"""Slopes of measured velocity against the position's change that pass for one."""
-SPAN = 16
-"""Samples over which velocity and change of position are compared."""
-CLEAR = 0.5
-"""Another convention of rotations fits clearly when it leaves at most so much of what MuJoCo's leaves."""
-TURN, FAST = 2 * np.pi, 0.05
-"""A turn in rad; an angle is too fast for its samples where more than this share of its steps are about half a turn."""
-JUMP, RARE = 8.0, 0.02
-"""A step is no motion where it is so many times faster than all others, and at most this share of them are."""
-ANSWER, SEVERAL = 0.1, 0.01
-"""What moves within so many seconds of an unusual command may answer it; at most this share of samples is bridged."""
-WINDOW = 9
-"""Samples of the filter that differentiates positions."""
+from sb3_rpto.sysid.data.settings import DATA
 
-
-#: A number in a message, not one that is part of a name.
-_NUMBER = re.compile(r"(?<![\w.,'\"+-])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])(?!\.\d)")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something about the data that a reader of the results must know.
-
-    :param kind: one of a few fixed words, e.g. ``"gap"`` or ``"wrapped angle"``
-    :param where: the episode and, where there is one, the column
-    :param message: what was found and what was done about it, in plain language
-    :param runs: names of the runs or episodes that it is about; none where it is about no single ones
-    """
-
-    kind: str
-    where: str
-    message: str
-    runs: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        return f"{self.kind} in {self.where}: {self.message}"
-
-    @classmethod
-    def of_run(cls, kind: str, run: str, place: str, message: str) -> Self:
-        """One about a single run.
-
-        :param place: the column there; may be empty
-        """
-        return cls(kind, f"{run}, {place}" if place else run, message, (run,))
-
-    @property
-    def place(self) -> str:
-        """Where it is, without the run."""
-        return self.where.removeprefix(self.runs[0]).removeprefix(", ") if len(self.runs) == 1 else self.where
-
-
-def listed(names: Sequence[str], most: int = 6) -> str:
-    """Names in a sentence, the first few where there are many."""
-    shown, more = [*names[:most]], len(names) - most
-    if more > 0:
-        return f"{', '.join(shown)} and {more} more"
-    return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
-
-
-def grouped(findings: Iterable[Finding]) -> list[Finding]:
-    """Findings that say the same of several runs or places as one, in their order.
-
-    Of several runs numbers may differ: a message then tells the least and the largest of each.
-
-    :param findings: such as were grouped before are left as they are
-    """
-    of_runs: dict[tuple[str, ...], list[Finding]] = {}
-    for finding in findings:
-        said = _NUMBER.sub("#", finding.message) if len(finding.runs) == 1 else finding.message
-        of_runs.setdefault((finding.kind, finding.place, said), []).append(finding)
-    of_places: dict[tuple[str, str, tuple[str, ...]], list[tuple[str, Finding]]] = {}
-    for alike in of_runs.values():
-        first = alike[0]
-        message = _ranges([finding.message for finding in alike])
-        runs = tuple(dict.fromkeys(run for finding in alike for run in finding.runs))
-        of_places.setdefault((first.kind, message, runs), []).append((first.place, first))
-    found = []
-    for (kind, message, runs), places in of_places.items():
-        first = places[0][1]
-        if len(places) == 1 and runs == first.runs:
-            found.append(first)
-            continue
-        where = listed([place for place, _ in places if place])
-        if len(runs) == 1:
-            where = f"{runs[0]}, {where}"
-        elif len(first.runs) == 1:
-            where = f"{where} of {listed(runs)}" if where else listed(runs)
-        found.append(Finding(kind, where, message, runs))
-    return found
-
-
-def _ranges(messages: Sequence[str]) -> str:
-    """Messages that differ in numbers alone as one."""
-    columns = zip(*(_NUMBER.findall(message) for message in messages))
-    ends = iter([(min(column, key=float), max(column, key=float)) for column in columns])
-
-    def between(number: re.Match[str]) -> str:
-        low, high = next(ends)
-        return low if float(low) == float(high) else f"{low} to {high}"
-
-    return _NUMBER.sub(between, messages[0]) if len(messages) > 1 else messages[0]
+#: A turn in rad.
+TURN = 2 * np.pi
 
 
 def split_at_gaps(time: np.ndarray) -> list[slice]:
@@ -134,7 +22,7 @@ def split_at_gaps(time: np.ndarray) -> list[slice]:
     if len(time) < 2:
         return [slice(0, len(time))]
     steps = np.diff(time)
-    cuts = np.flatnonzero(steps > GAP * np.median(steps)) + 1
+    cuts = np.flatnonzero(steps > DATA.gap * np.median(steps)) + 1
     edges = [0, *cuts.tolist(), len(time)]
     return [slice(start, stop) for start, stop in pairwise(edges)]
 
@@ -147,7 +35,7 @@ def jitter(time: np.ndarray) -> float:
     :param time: increasing times in s, shape (T,) with T >= 2
     """
     steps = np.diff(time) / np.median(np.diff(time))
-    ticks = np.where(steps <= GAP, np.maximum(np.round(steps), 1), 1)
+    ticks = np.where(steps <= DATA.gap, np.maximum(np.round(steps), 1), 1)
     return float(np.quantile(np.abs(steps - ticks), 0.95))
 
 
@@ -167,13 +55,13 @@ def divided_differences(time: np.ndarray, position: np.ndarray, order: int) -> n
     return np.asarray((weights * q).sum(1) / np.sqrt((weights**2).sum(1)))
 
 
-def missing(time: np.ndarray) -> int:
+def count_missing_rows(time: np.ndarray) -> int:
     """Number of steps over which, by the others, at least one sample is missing, gaps left out.
 
     :param time: increasing times in s, shape (T,) with T >= 2
     """
     steps = np.diff(time) / np.median(np.diff(time))
-    return int(np.count_nonzero((steps > SKIPPED) & (steps <= GAP)))
+    return int(np.count_nonzero((steps > DATA.missing_row) & (steps <= DATA.gap)))
 
 
 def unwrap(angle: np.ndarray, change: np.ndarray | None = None) -> tuple[np.ndarray, int, bool]:
@@ -192,7 +80,7 @@ def unwrap(angle: np.ndarray, change: np.ndarray | None = None) -> tuple[np.ndar
         return angle, 0, False
     jumps = np.where(np.abs(np.abs(steps) - TURN) < TURN / 4, np.sign(steps), 0.0)
     unsure = np.abs(np.abs(steps) - TURN / 2) < TURN / 4  # of about half a turn: either way is as near
-    fast = float(np.mean(unsure)) > FAST
+    fast = float(np.mean(unsure)) > DATA.fast_angle
     if fast and change is not None:
         told = np.round((steps - change) / TURN)
         if (np.abs(steps - change - TURN * told)[unsure] < TURN / 8).all():
@@ -213,7 +101,7 @@ def glitches(time: np.ndarray, position: np.ndarray) -> np.ndarray:
     """
     speed, wrong = np.diff(position) / np.diff(time), np.zeros(len(position), dtype=bool)
     steps, step = np.abs(np.diff(position)), float(np.median(np.diff(time)))
-    if len(time) < SPAN or not steps.any():
+    if len(time) < DATA.slope_span or not steps.any():
         return wrong
     far = 2 * max(float(np.quantile(steps, 0.9)), float(np.median(steps[steps > 0])))
     for rows in (1, 2):
@@ -223,7 +111,7 @@ def glitches(time: np.ndarray, position: np.ndarray) -> np.ndarray:
         off = [position[first + r + 1] - (1 - x) * position[first] - x * position[last] for r, x in enumerate(share)]
         off += [position[first + 1] - position[first], position[last - 1] - position[last]]  # and far from either
         least = np.min(np.abs(off), axis=0) * np.all(np.sign(off) == np.sign(off[0]), axis=0)
-        for k in first[(least > JUMP * np.maximum(change, np.quantile(change, 0.9))) & (least > far)]:
+        for k in first[(least > DATA.jump * np.maximum(change, np.quantile(change, 0.9))) & (least > far)]:
             wrong[k + 1 : k + 1 + rows] = True
     return wrong
 
@@ -241,7 +129,7 @@ def after_commands(time: np.ndarray, commands: np.ndarray) -> np.ndarray:
     unusual = np.flatnonzero((changes > 2 * np.quantile(changes, 0.9, axis=0)).any(axis=1))
     found = np.zeros(len(time), dtype=int)
     for k in unusual:  # between samples k and k + 1, which may have been recorded after it was sent
-        found[k : max(k + 4, int(np.searchsorted(time, time[k + 1] + ANSWER, "right")))] += 1
+        found[k : max(k + 4, int(np.searchsorted(time, time[k + 1] + DATA.command_answer, "right")))] += 1
     return found > 1
 
 
@@ -255,14 +143,14 @@ def jumps(time: np.ndarray, position: np.ndarray) -> np.ndarray:
     steps = np.diff(time)
     speed = np.abs(np.diff(position)) / np.maximum(steps, np.median(steps))  # a row may be stamped late
     falling = np.sort(speed)[::-1]
-    most = max(1, int(RARE * len(speed)))
+    most = max(1, int(DATA.jump_share * len(speed)))
     larger, smaller = falling[:most], falling[1 : most + 1]
     if len(smaller) < most or not (moving := smaller > 0).any():
         return np.zeros(len(speed), dtype=bool)
     apart = np.where(moving, larger / np.where(moving, smaller, 1.0), 0.0)
     found = speed > smaller[int(np.argmax(apart))]
     single = not (found[1:] & found[:-1]).any()
-    return found if apart.max() > JUMP and single else np.zeros_like(found)
+    return found if apart.max() > DATA.jump and single else np.zeros_like(found)
 
 
 def align_quaternions(quaternions: np.ndarray) -> int:
@@ -276,7 +164,7 @@ def align_quaternions(quaternions: np.ndarray) -> int:
     return int(opposite.sum())
 
 
-def smoothed_velocity(time: np.ndarray, position: np.ndarray, window: int = WINDOW) -> np.ndarray:
+def smoothed_velocity(time: np.ndarray, position: np.ndarray, window: int = DATA.filter_rows) -> np.ndarray:
     """Differentiate a position on the run's own clock with a cubic Savitzky-Golay filter.
 
     Position and time are both differentiated by sample number, and dq/dt = (dq/di) / (dt/di): so a jittered clock
@@ -325,7 +213,7 @@ def turning_convention(time: np.ndarray, quaternions: np.ndarray, velocity: np.n
     size = float(np.linalg.norm(velocity))
     errors = {said: float(np.linalg.norm(reading - velocity)) for said, reading in readings.items()}
     best = min(errors, key=lambda said: errors[said])
-    clear = errors[best] < CLEAR * min(size, errors[""])
+    clear = errors[best] < DATA.convention * min(size, errors[""])
     return best if best and clear else None
 
 
@@ -363,26 +251,26 @@ def _least_step(levels: np.ndarray) -> float:
     return float(min(steps[steps > least], default=0.0))
 
 
-def held(positions: np.ndarray) -> int | None:
+def rows_per_reading(positions: np.ndarray) -> int | None:
     """Rows per fresh reading, where all positions are repeated between readings, (n, m); None where they are not.
 
     A coarse encoder repeats itself too, but changes by one step, and when the motion says so.
     """
     steps = np.diff(positions, axis=0)
     fresh = np.flatnonzero(np.any(steps != 0, axis=1))
-    if len(fresh) < FEWEST_READINGS:
+    if len(fresh) < DATA.held_readings:
         return None
     gaps = np.diff(fresh)
     usual = int(np.median(gaps))
     low, high = np.quantile(gaps, (0.1, 0.9))
     moved = max(len(np.unique(np.abs(steps[fresh, i]).round(12))) for i in range(positions.shape[1]))
-    return usual if usual >= 2 and low >= 2 and high <= 1.5 * usual and moved > FEWEST_STEPS else None
+    return usual if usual >= 2 and low >= 2 and high <= 1.5 * usual and moved > DATA.held_changes else None
 
 
 def velocity_slope(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> float | None:
     """Slope of a measured velocity against the position's change: of all that the noise leaves open, the nearest to 1.
 
-    The velocity's integral over :data:`SPAN` samples is compared with the position's change over them, where both are
+    The velocity's integral over 16 samples is compared with the position's change over them, where both are
     large against their noise. The least-squares slope on a noisy quantity is too small, and that of the inverse
     regression too large: the true one lies between them (Frisch 1934).
 
@@ -396,7 +284,7 @@ def velocity_slope(time: np.ndarray, position: np.ndarray, velocity: np.ndarray)
     noise = float(np.std(np.diff(position, 3))) / np.sqrt(20)
     if np.ptp(position) <= 50 * noise or np.ptp(position) < 1e-9:
         return None
-    span = min(SPAN, len(time) // 2)
+    span = min(DATA.slope_span, len(time) // 2)
     integral = cumulative_trapezoid(velocity, time, initial=0)
     return _slope(*(x[span:] - x[:-span] for x in (position, integral)))
 
@@ -413,7 +301,7 @@ def turning_slope(time: np.ndarray, quaternions: np.ndarray, velocity: np.ndarra
     orientation = Rotation.from_quat(np.roll(quaternions, -1, axis=1))  # scipy has w last
     moved = (orientation[:-1].inv() * orientation[1:]).as_rotvec()
     said = 0.5 * np.diff(time)[:, None] * (velocity[1:] + velocity[:-1])
-    span = min(SPAN, len(time) // 2)
+    span = min(DATA.slope_span, len(time) // 2)
     sums = (np.cumsum(np.concatenate([np.zeros((1, 3)), x]), axis=0) for x in (moved, said))
     return _slope(*((x[span:] - x[:-span]).ravel() for x in sums))
 

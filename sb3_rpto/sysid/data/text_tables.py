@@ -32,48 +32,11 @@ _SI = {
 }
 _NO_UNIT = ("", "-", "1", "none", "n/a")
 #: Those of other tables.
-_OTHERS = frozenset(
-    [
-        "ms",
-        "msec",
-        "us",
-        "ns",
-        "min",
-        "h",
-        "milliseconds",
-        "microseconds",
-        "nanoseconds",
-        "deg",
-        "°",
-        "degree",
-        "degrees",
-        "rev",
-        "revs",
-        "turns",
-        "counts",
-        "ticks",
-        "mrad",
-        "deg/s",
-        "°/s",
-        "degrees/s",
-        "rpm",
-        "rev/s",
-        "mrad/s",
-        "mm",
-        "cm",
-        "um",
-        "in",
-        "inch",
-        "mm/s",
-        "cm/s",
-        "nmm",
-        "n*mm",
-        "ncm",
-        "n*cm",
-        "mnm",
-        "mn*m",
-    ]
+_OTHER_UNITS = (
+    "ms msec us ns min h milliseconds microseconds nanoseconds deg ° degree degrees rev revs turns counts ticks mrad "
+    "deg/s °/s degrees/s rpm rev/s mrad/s mm cm um in inch mm/s cm/s nmm n*mm ncm n*cm mnm mn*m"
 )
+_OTHERS = frozenset(_OTHER_UNITS.split())
 
 
 def read_text(path: str, rename: Mapping[str, str] | None = None) -> dict[str, np.ndarray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding
 from sb3_rpto.sysid.hypotheses.blocks_of_all_runs import BlocksOfAllRuns
 from sb3_rpto.sysid.hypotheses.column_errors import ColumnErrors
 from sb3_rpto.sysid.hypotheses.encoder_offsets import OffsetsOfRuns

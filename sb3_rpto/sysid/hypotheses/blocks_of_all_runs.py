@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.selection.adequacy import adequacy
@@ -31,4 +31,4 @@ class BlocksOfAllRuns(Hypothesis):
             "the runs set apart to select on do not show what is missing in the others: blocks of all of them take "
             "turns"
         )
-        return Finding("split", "fitted runs", message)
+        return Finding(FindingKind.SPLIT, "fitted runs", message)

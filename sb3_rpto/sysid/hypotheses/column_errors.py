@@ -14,10 +14,9 @@ from sb3_rpto.effects.names import SCALAR_JOINTS, object_names
 from sb3_rpto.sysid.data.columns import Columns, joint_of
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind, Hint
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
-from sb3_rpto.sysid.problem.unsupported_elements import Hint
 from sb3_rpto.sysid.selection.confidence_intervals import FinalFit
 from sb3_rpto.sysid.selection.search import SearchResult
 from sb3_rpto.sysid.shooting.multiple_shooting import START_STEPS, Problem
@@ -37,7 +36,7 @@ class Reading:
     :param joints: that it concerns; none: all
     """
 
-    kind: str
+    kind: FindingKind
     where: str
     what: str
     remedy: str
@@ -58,7 +57,7 @@ def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
     if columns.ctrl:
         what = f"with all commands one sample ({step:.3g} s) earlier"
         remedy = "each row seems to hold the command of the row before; shift the ctrl columns up a row"
-        yield Reading("early response", "all episodes, ctrl", what, remedy, _earlier, positions)
+        yield Reading(FindingKind.EARLY_RESPONSE, "all episodes, ctrl", what, remedy, _earlier, positions)
     types = {name: int(model.jnt_type[i]) for i, name in enumerate(object_names(model, "joint"))}
     scalar = [i for i, name in enumerate(columns.qpos) if types[joint_of(name)] in SCALAR_JOINTS]
     scalar = [i for i in scalar if columns.qpos[i] not in data.unobserved]
@@ -70,28 +69,28 @@ def readings(model: mujoco.MjModel, data: Measurements) -> Iterator[Reading]:
             speeds = _exchanged(len(columns.qvel), columns.qvel.index(one), columns.qvel.index(other))
             where, what = f"qpos.{one}, qpos.{other}", f"with the positions of {one} and {other} exchanged"
             again = _reordered(order, speeds)
-            yield Reading("exchanged", where, what, "exchange them", again, order, (one, other))
+            yield Reading(FindingKind.EXCHANGED, where, what, "exchange them", again, order, (one, other))
             if len(motors[i]) == len(motors[j]) == 1:
                 (k,), (m,) = motors[i], motors[j]
                 where += f", ctrl.{columns.ctrl[k]}, ctrl.{columns.ctrl[m]}"
                 what = f"with {one} and {other} exchanged, positions and commands"
                 both = _in_turn(again, _told(_exchanged(len(columns.ctrl), k, m)))
-                yield Reading("exchanged", where, what, "exchange them", both, order, (one, other))
+                yield Reading(FindingKind.EXCHANGED, where, what, "exchange them", both, order, (one, other))
     for i, j in combinations(range(len(columns.ctrl)), 2):
         one, other = columns.ctrl[i], columns.ctrl[j]
         where, what = f"ctrl.{one}, ctrl.{other}", f"with the commands of {one} and {other} exchanged"
         again = _told(_exchanged(len(columns.ctrl), i, j))
-        yield Reading("exchanged", where, what, "exchange them", again, positions)
+        yield Reading(FindingKind.EXCHANGED, where, what, "exchange them", again, positions)
     for i in scalar:
         name, speed = columns.qpos[i], columns.qvel.index(columns.qpos[i])
         what, remedy = f"with the sign of {name} reversed", "let the column count as the model's axis does"
-        yield Reading("reversed", f"qpos.{name}", what, remedy, _reversed(i, speed, []), positions, (name,))
+        yield Reading(FindingKind.REVERSED, f"qpos.{name}", what, remedy, _reversed(i, speed, []), positions, (name,))
         if motors[i]:  # the machine's axis may be the other way round, for its commands as well
             commands = [columns.ctrl[k] for k in motors[i]]
             where = ", ".join([f"qpos.{name}", *(f"ctrl.{command}" for command in commands)])
             what = f"with the signs of {' and '.join([name, *commands])} reversed"
             remedy = "let these columns count as the model's axis does"
-            yield Reading("reversed", where, what, remedy, _reversed(i, speed, motors[i]), positions, (name,))
+            yield Reading(FindingKind.REVERSED, where, what, remedy, _reversed(i, speed, motors[i]), positions, (name,))
 
 
 class ColumnErrors(Hypothesis):

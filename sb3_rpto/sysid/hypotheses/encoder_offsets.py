@@ -13,7 +13,7 @@ from sb3_rpto.effects import Scales, Simulation
 from sb3_rpto.effects.sensors import readers
 from sb3_rpto.sysid.data.encoder_offsets import EncoderOffsets
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.selection.adequacy import adequacy

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_rpto.effects import Simulation
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.selection.confidence_intervals import FinalFit
@@ -39,4 +39,4 @@ class FinerSteps(Hypothesis):
             "does, as a machine or another simulator; shorten the timestep in the MJCF's <option>, and raise "
             "frame_skip in proportion"
         )
-        return [Finding("time step", "the model", message)]
+        return [Finding(FindingKind.TIME_STEP, "the model", message)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sb3_rpto.effects import LIBRARY
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.selection.search import SearchResult
@@ -36,4 +36,4 @@ class HeldForces(Hypothesis):
             "forces stay what they are at the beginning of a step of the environment until its end, as where a wrapper "
             "writes them, and no machine's do"
         )
-        return Finding("held forces", "fitted runs", message) if any(e.held for e in result.named) else None
+        return Finding(FindingKind.HELD_FORCES, "fitted runs", message) if any(e.held for e in result.named) else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis, kept_effects
 from sb3_rpto.sysid.problem.data_origin import are_exact_states, find_origin, may_be_exact
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
@@ -34,7 +34,7 @@ class SimulatorSubsteps(Hypothesis):
             f"from the model's integrator in steps of {step:g} ms, as a simulator's are: it meets them better than the "
             "continuous motion does"
         )
-        return Finding("simulated", "fitted runs", message)
+        return Finding(FindingKind.SIMULATED, "fitted runs", message)
 
 
 class SimulatorSteps(Hypothesis):
@@ -58,7 +58,7 @@ class SimulatorSteps(Hypothesis):
     def finding(self, alternative: IdentificationProblem, result: SearchResult) -> Finding:
         """When that showed."""
         message = "from the model's own steps in time, as shows with what was found first; searched again in such steps"
-        return Finding("simulated", "fitted runs", message)
+        return Finding(FindingKind.SIMULATED, "fitted runs", message)
 
 
 class ExactStates(Hypothesis):
@@ -88,4 +88,4 @@ class ExactStates(Hypothesis):
     def finding(self, alternative: IdentificationProblem, result: SearchResult) -> Finding:
         """When that showed."""
         message = "from the model's own steps in time, without noise, as shows with what was found: searched again"
-        return Finding("simulated", "fitted runs", message)
+        return Finding(FindingKind.SIMULATED, "fitted runs", message)

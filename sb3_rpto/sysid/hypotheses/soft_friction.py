@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_rpto.effects import LIBRARY, Declared, Effect, Simulation
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind, Hint
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
-from sb3_rpto.sysid.problem.unsupported_elements import Hint
 from sb3_rpto.sysid.selection.confidence_intervals import FinalFit
 from sb3_rpto.sysid.selection.search import SearchResult
 from sb3_rpto.sysid.settings import HypothesisSettings
@@ -49,7 +48,7 @@ class SoftFriction(Hypothesis):
     def finding(self, alternative: IdentificationProblem, result: SearchResult) -> Finding:
         """That friction gives way."""
         message = "dry friction gives way near rest, as MuJoCo's frictionloss alone does and a machine's hardly"
-        return Finding("soft friction", "fitted runs", message)
+        return Finding(FindingKind.SOFT_FRICTION, "fitted runs", message)
 
     def hints(self, problem: IdentificationProblem, result: SearchResult, fit: FinalFit) -> list[Finding]:
         """Whether dry friction of a machine that gives way at rest would leave less."""
@@ -67,7 +66,7 @@ class SoftFriction(Hypothesis):
             "soft_friction among the candidates, or among the known effects"
         )
         bodies = frozenset(int(model.dof_bodyid[e.dof]) for e in firm)
-        return [Hint("soft friction", ", ".join(e.label for e in firm), message, bodies=bodies, left=share)]
+        return [Hint(FindingKind.SOFT_FRICTION, ", ".join(e.label for e in firm), message, bodies=bodies, left=share)]
 
 
 def share_of_creeping(

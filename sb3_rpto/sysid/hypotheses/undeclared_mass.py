@@ -7,17 +7,19 @@ import numpy as np
 from sb3_rpto.effects import Declared, Scales, Simulation
 from sb3_rpto.effects.library import candidates
 from sb3_rpto.effects.names import object_id
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding, FindingKind, Hint
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
-from sb3_rpto.sysid.problem.unsupported_elements import Hint
 from sb3_rpto.sysid.selection.confidence_intervals import FinalFit
 from sb3_rpto.sysid.selection.search import SearchResult
 from sb3_rpto.sysid.shooting.multiple_shooting import Problem
 from sb3_rpto.sysid.shooting.windows import cut
 
 #: The effects that change a body's mass and inertia, and what to declare then.
-DECLARE = {"mass_scale": "mass", "inertia_scale": "inertia"}
+DECLARE = {
+    "mass_scale": ("mass", FindingKind.UNDECLARED_MASS),
+    "inertia_scale": ("inertia", FindingKind.UNDECLARED_INERTIA),
+}
 
 
 class UndeclaredMass(Hypothesis):
@@ -56,10 +58,10 @@ class UndeclaredMass(Hypothesis):
         if best is None:
             return []
         scale, times = best
-        what = DECLARE[scale.kind]
+        what, kind = DECLARE[scale.kind]
         message = (
             f"with {times:.3g} times its {what} the model errs by {share:.0%} of what it does: declare "
             f"{scale.on}.{what}, and trace again"
         )
         where = frozenset({object_id(problem.nominal, "body", scale.on)})
-        return [Hint(f"undeclared {what}", scale.on, message, bodies=where, left=share)]
+        return [Hint(kind, scale.on, message, bodies=where, left=share)]

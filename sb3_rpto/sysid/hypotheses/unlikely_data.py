@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.findings import Finding
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
 from sb3_rpto.sysid.problem.data_model_consistency import unlikely_columns
 from sb3_rpto.sysid.problem.problem import IdentificationProblem

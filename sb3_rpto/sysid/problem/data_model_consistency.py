@@ -15,12 +15,13 @@ from sb3_rpto.effects.actuation import FILTERS
 from sb3_rpto.effects.batch import MujocoBatch
 from sb3_rpto.effects.names import near, object_id, object_names
 from sb3_rpto.effects.simulation import prepare
-from sb3_rpto.sysid.data.angle_units import check_degrees, large_angles
 from sb3_rpto.sysid.data.columns import columns_of, joint_of
-from sb3_rpto.sysid.data.inverse_dynamics_terms import actuation, inverse, through, window_of
+from sb3_rpto.sysid.data.inverse_dynamics_terms import actuator_forces, filter_length, filtered_force, required_forces
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding, smoothed_velocity
-from sb3_rpto.sysid.problem.unsupported_elements import Hint, mocap_bodies, moved_by_mocap, of_actuator
+from sb3_rpto.sysid.data.repairs import check_degrees, large_angles
+from sb3_rpto.sysid.data.signal_quality import smoothed_velocity
+from sb3_rpto.sysid.findings import Finding, FindingKind, Hint
+from sb3_rpto.sysid.problem.unsupported_elements import mocap_bodies, moved_by_mocap, of_actuator
 from sb3_rpto.sysid.settings import DEFAULTS, ConsistencySettings, Settings
 from sb3_rpto.sysid.shooting.windows import command_order, discretised, is_stiff
 
@@ -119,7 +120,7 @@ def soft_friction(model: mujoco.MjModel, soft: float = DEFAULTS.consistency.soft
                 f"dry friction gives way over some {1e3 * model.dof_solref[dof, 0]:g} ms (its solreffriction); a "
                 'machine\'s holds: set solreffriction="0.001 1" solimpfriction="0.99 0.99" in the model'
             )
-            found.append(Finding("soft friction", f"joint {name}", message))
+            found.append(Finding(FindingKind.SOFT_FRICTION, f"joint {name}", message))
     return found
 
 
@@ -134,7 +135,7 @@ def soft_ties(model: mujoco.MjModel, soft: float = DEFAULTS.consistency.soft) ->
             f'machine\'s is rigid, set solref="{max(0.002, 2 * model.opt.timestep):g} 1" '
             'solimp="0.99 0.999 0.0001" in the model, or a sensor_bias may be named that makes up for it'
         )
-        found.append(Finding("soft tie", f"equality {model.equality(tie).name or tie}", message))
+        found.append(Finding(FindingKind.SOFT_TIE, f"equality {model.equality(tie).name or tie}", message))
     return found
 
 
@@ -147,7 +148,7 @@ def carried_weights(model: mujoco.MjModel) -> list[Finding]:
         "no weight, and is hardly found. A controller carries what it was told: take gravcomp out of the model, and "
         "give what the motors put out, the controller's part with it, as the commands"
     )
-    return [Finding("gravity compensation", f"body {', '.join(bodies)}", message)] if bodies else []
+    return [Finding(FindingKind.GRAVITY_COMPENSATION, f"body {', '.join(bodies)}", message)] if bodies else []
 
 
 def check_clock(
@@ -197,17 +198,17 @@ def _sampling(model: mujoco.MjModel, data: Measurements, settings: Settings) -> 
             f"the median step of {step:.4g} s is no whole multiple of the model's timestep of {timestep:.4g} s; "
             f"one of {step / max(1, np.ceil(step / timestep)):.6g} s would be"
         )
-        found.append(Finding("sampling", f"{ALL}, time", message))
+        found.append(Finding(FindingKind.SAMPLING, f"{ALL}, time", message))
     if not (data.exact or data.simulated) and is_stiff(discretised(model, data, fine=False, settings=settings.problem)):
         message = "too stiff for the Runge-Kutta method at this timestep: integrated implicitly, less finely"
-        found.append(Finding("stiff model", "the model", message))
+        found.append(Finding(FindingKind.STIFF_MODEL, "the model", message))
     if step > 1.01 * settings.consistency.slow_step and not data.exact:
         message = (
             f"the median step is {step:.4g} s; effects faster than that, such as a short delay, leave no trace, and "
             "what the motion does between samples passes for an error of the model: log faster, or, of a "
             "simulator's own steps, pass its transitions (Measurements.from_replay)"
         )
-        found.append(Finding("slow sampling", f"{ALL}, time", message))
+        found.append(Finding(FindingKind.SLOW_SAMPLING, f"{ALL}, time", message))
     return found
 
 
@@ -230,7 +231,7 @@ def _clipped(model: mujoco.MjModel, data: Measurements, settings: ConsistencySet
                 f"{beyond:.1%} of the samples are outside the model's ctrlrange [{low:g}, {high:g}], where it clips "
                 "them: other units, or too narrow a range?"
             )
-            found.append(Finding("clipped command", f"{ALL}, ctrl.{name}", message))
+            found.append(Finding(FindingKind.CLIPPED_COMMAND, f"{ALL}, ctrl.{name}", message))
     return found
 
 
@@ -243,12 +244,14 @@ def unlikely_columns(model: mujoco.MjModel, data: Measurements) -> list[Hint]:
             'angle="degree")'
         )
         there = frozenset({int(model.jnt_bodyid[object_id(model, "joint", name)])})
-        found.append(Hint("large angle", f"{ALL}, qpos.{name}", message, bodies=there))
+        found.append(Hint(FindingKind.LARGE_ANGLE, f"{ALL}, qpos.{name}", message, bodies=there))
     for column, (name, i) in enumerate(zip(data.columns.ctrl, command_order(model, data))):
         commands = np.concatenate([e.ctrl[:, column] for e in data.episodes])
         if np.ptp(commands) == 0:
             message = f"it is {commands[0]:g} throughout; is that what the actuator was told?"
-            found.append(Hint("constant command", f"{ALL}, ctrl.{name}", message, bodies=of_actuator(model, i)))
+            found.append(
+                Hint(FindingKind.CONSTANT_COMMAND, f"{ALL}, ctrl.{name}", message, bodies=of_actuator(model, i))
+            )
     for column, (name, i) in enumerate(zip(data.columns.ctrl, command_order(model, data))):
         plain = model.actuator_biastype[i] == _NO_BIAS and model.actuator_dyntype[i] == _NO_DYNAMICS
         if not (plain and model.actuator_forcelimited[i] and model.actuator_gaintype[i] == _FIXED):
@@ -261,7 +264,7 @@ def unlikely_columns(model: mujoco.MjModel, data: Measurements) -> list[Hint]:
                 f"{beyond:.1%} of the samples ask for more than the model's forcerange [{low:g}, {high:g}], where it "
                 "limits the force: is that the machine's range?"
             )
-            found.append(Hint("limited force", f"{ALL}, ctrl.{name}", message, bodies=of_actuator(model, i)))
+            found.append(Hint(FindingKind.LIMITED_FORCE, f"{ALL}, ctrl.{name}", message, bodies=of_actuator(model, i)))
     return found
 
 
@@ -300,7 +303,7 @@ def _responses(model: mujoco.MjModel, data: Measurements, settings: ConsistencyS
                 f"the motion follows about {lag} samples ({lag * step:.3g} s) late: a delay or lag in the actuator, or "
                 "channels that were not recorded at the same time"
             )
-            found.append(Finding("late response", f"{ALL}, {where}", message))
+            found.append(Finding(FindingKind.LATE_RESPONSE, f"{ALL}, {where}", message))
         else:
             lag = int(np.argmax(strength[: settings.lag + 1]))
         found += _signs(where, {run: (c[0][lag], c[1][lag]) for run, c in correlations.items()}, settings)
@@ -318,11 +321,11 @@ def _signs(where: str, fits: dict[str, tuple[float, float]], settings: Consisten
             f"in every run the motion needs the opposite force (correlation {mean:.2f}): "
             "its sign is flipped, or the model lacks a force larger than those it has; kept as it is"
         )
-        return [Finding("flipped sign", f"{ALL}, {where}", message)]
+        return [Finding(FindingKind.FLIPPED_SIGN, f"{ALL}, {where}", message)]
     if not right:
         return []
     message = "here, unlike in other runs, the motion needs the opposite force (correlation {:.2f}); kept as it is"
-    return [Finding.of_run("flipped sign", run, where, message.format(fits[run][0])) for run in flipped]
+    return [Finding.of_run(FindingKind.FLIPPED_SIGN, run, where, message.format(fits[run][0])) for run in flipped]
 
 
 def _correlate(
@@ -370,27 +373,27 @@ def _forces(model: mujoco.MjModel, data: Measurements, settings: ConsistencySett
             model = world.engine.get_model(0)
         time = episode.time[rows]
         step = float(np.median(np.diff(time)))
-        window = window_of(step, data.exact)
+        window = filter_length(step, data.exact)
         qpos, qvel = episode.qpos[rows][:, order["qpos"]], episode.qvel[rows][:, order["qvel"]]
         qacc = smoothed_velocity(time, qvel, window)
         if not data.exact:
             size = min(window, n - (n + 1) % 2)
             qpos, qvel = (savgol_filter(array, size, 3, axis=0) for array in (qpos, qvel))
-        needed, free = inverse(model, qpos, qvel, qacc)
+        needed, free = required_forces(model, qpos, qvel, qacc)
         ctrl = episode.ctrl[rows][:, order["ctrl"]]
-        idle = actuation(model, time, qpos, qvel, np.zeros_like(ctrl))
-        told = actuation(model, time, qpos, qvel, ctrl) - idle
+        idle = actuator_forces(model, time, qpos, qvel, np.zeros_like(ctrl))
+        told = actuator_forces(model, time, qpos, qvel, ctrl) - idle
         usable = free & episode.usable[rows] & episode.enabled[rows].all(axis=1)
         clear = binary_erosion(usable, np.ones(window), border_value=1)
         for j in np.flatnonzero(model.jnt_type >= _SLIDE).tolist():
             dof = model.jnt_dofadr[j]
             if np.any(told[:, dof]):
-                given = through(time, told[:, dof], window)
+                given = filtered_force(time, told[:, dof], window)
                 yield _Force(episode.run, _label(model, j), (needed - idle)[:, dof], given, clear)
             name = own.qvel[dof]
             if name in data.columns.qfrc:
                 measured = episode.qfrc[rows][:, data.columns.qfrc.index(name)]
-                yield _Force(episode.run, f"qfrc.{name}", needed[:, dof], through(time, measured, window), clear)
+                yield _Force(episode.run, f"qfrc.{name}", needed[:, dof], filtered_force(time, measured, window), clear)
 
 
 def _label(model: mujoco.MjModel, joint: int) -> str:

@@ -17,7 +17,7 @@ from sb3_rpto.effects.simulation import Active, Switch, collect, filter_commands
 from sb3_rpto.sysid.data.coordinates import straight, velocity_addresses
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
-from sb3_rpto.sysid.data.signal_quality import MIN_ROWS
+from sb3_rpto.sysid.data.settings import DATA
 from sb3_rpto.sysid.shooting.windows import command_order
 
 #: Cut-off of the zero-phase low pass in Hz; lower where the sampling asks for it.
@@ -68,7 +68,7 @@ def force_residuals(simulation: Simulation, values: np.ndarray, data: Measuremen
     :param values: their parameters, (p,)
     :param data: recordings
     """
-    return [_residual(simulation, values, data, e) for e in data.episodes if len(e) >= MIN_ROWS]
+    return [_residual(simulation, values, data, e) for e in data.episodes if len(e) >= DATA.min_rows]
 
 
 def _residual(simulation: Simulation, values: np.ndarray, data: Measurements, e: Episode) -> ForceResidual:
@@ -266,7 +266,7 @@ def typical(simulation: Simulation, residuals: list[ForceResidual]) -> Typical:
     :raises ValueError: there are none
     """
     if not residuals:
-        raise ValueError(f"no episode has {MIN_ROWS} samples to find forces from; record longer ones")
+        raise ValueError(f"no episode has {DATA.min_rows} samples to find forces from; record longer ones")
     model = simulation.model
     mj = mujoco.MjData(model)
     mujoco.mj_forward(model, mj)

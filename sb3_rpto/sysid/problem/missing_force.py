@@ -12,7 +12,7 @@ from sb3_rpto.effects.batch import MujocoBatch
 from sb3_rpto.effects.simulation import prepare
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
-from sb3_rpto.sysid.data.signal_quality import MIN_ROWS
+from sb3_rpto.sysid.data.settings import DATA
 from sb3_rpto.sysid.problem.inverse_dynamics import ForceResidual, force_residuals
 from sb3_rpto.sysid.shooting.windows import Windows, cut
 
@@ -31,7 +31,7 @@ def missing_forces(simulation: Simulation, values: np.ndarray, data: Measurement
     found = force_residuals(simulation, values, data)
     if not data.exact:
         return found
-    episodes = (e for e in data.episodes if len(e) >= MIN_ROWS)
+    episodes = (e for e in data.episodes if len(e) >= DATA.min_rows)
     by_step = [_step_by_step(simulation, values, data, r, e) for r, e in zip(found, episodes)]
     return [r for r in by_step if len(r.time) > 1]
 

@@ -21,11 +21,10 @@ from sb3_rpto.effects.names import near
 from sb3_rpto.effects.validate_effect import try_out
 from sb3_rpto.envs.step_fidelity import odd_step
 from sb3_rpto.sysid.data.encoder_offsets import EncoderOffsets
-from sb3_rpto.sysid.data.encoder_unwrapping import settle_turns
 from sb3_rpto.sysid.data.measurements import Measurements
 from sb3_rpto.sysid.data.recording import Episode
-from sb3_rpto.sysid.data.sample_clock import settle_clock
-from sb3_rpto.sysid.data.signal_quality import Finding
+from sb3_rpto.sysid.data.repairs import remove_whole_turns, use_even_clock
+from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.problem.contacts import contact_changes
 from sb3_rpto.sysid.problem.data_model_consistency import carried_weights, check_against, soft_friction, soft_ties
 from sb3_rpto.sysid.problem.data_origin import begins_idle, find_origin
@@ -295,8 +294,8 @@ def _check(inputs: Inputs, assumptions: Assumptions, model: mujoco.MjModel) -> t
         simulated=inputs.data.simulated or assumptions.simulated,
         substeps=inputs.data.substeps if assumptions.substeps == 1 else assumptions.substeps,
     )
-    data, turned = settle_turns(model, data)
-    data, clock = settle_clock(data)
+    data, turned = remove_whole_turns(model, data)
+    data, clock = use_even_clock(data)
     checked = check_against(model, data, inputs.settings)
     return data, [*data.findings, *turned, *clock, *checked, *_own_step(inputs.model)]
 
@@ -308,7 +307,7 @@ def _part(data: Measurements, seed: int, findings: list[Finding]) -> tuple[Measu
     findings += [f for f in parts[0].findings if f not in findings]
     resting = columns_at_rest(replace(data, episodes=[*split.train, *split.select]))
     message = "never changes, so nothing tells how finely it is measured: it is not compared with predictions"
-    findings += [Finding("at rest", f"fitted runs, qpos.{name}", message) for name in resting]
+    findings += [Finding(FindingKind.AT_REST, f"fitted runs, qpos.{name}", message) for name in resting]
     return replace(data, unobserved=(*data.unobserved, *resting)), split
 
 
@@ -324,7 +323,7 @@ def _length(
     length = _horizon(fitted, touching, settings)
     if touching:
         message = f"{changes:.1f} a second come or go; windows of {length:.2g} s, as errors about a touch-down grow"
-        findings.append(Finding("contacts", "fitted runs", message))
+        findings.append(Finding(FindingKind.CONTACTS, "fitted runs", message))
     return length, touching
 
 
@@ -332,7 +331,7 @@ def _of_a_simulator(data: Measurements, exact: bool, findings: list[Finding]) ->
     """The recordings as a simulator's own, with noise or ``exact``; that joins the findings."""
     noise = "without noise" if exact else "with noise"
     message = f"from the model's own steps in time, {noise}: they meet them better than the continuous motion does"
-    findings.append(Finding("simulated", "fitted runs", message))
+    findings.append(Finding(FindingKind.SIMULATED, "fitted runs", message))
     return replace(data, simulated=True, exact=exact, noise=None if exact else data.noise)
 
 
@@ -360,7 +359,7 @@ def _without_a_place(model: mujoco.MjModel, kinds: Sequence[str] | None) -> list
     """Kinds that were named among the candidates and sit nowhere in this model."""
     nowhere = [kind for kind in kinds or () if not LIBRARY[kind].places(model)]
     message = "named among the candidates, but nothing in this model can have it: it is not looked for"
-    return [Finding("no place", kind, message) for kind in dict.fromkeys(nowhere)]
+    return [Finding(FindingKind.NO_PLACE, kind, message) for kind in dict.fromkeys(nowhere)]
 
 
 def _own_step(model: Any) -> list[Finding]:
@@ -375,7 +374,7 @@ def _own_step(model: Any) -> list[Finding]:
         f"{found}. The MJCF alone is compared with the data: what step() adds is named as missing where the data show "
         "it, and is there twice in a corrected environment. Make it part of the MJCF or an effect, or leave it out"
     )
-    return [Finding("own step", "step() of the environment", message)]
+    return [Finding(FindingKind.OWN_STEP, "step() of the environment", message)]
 
 
 def make_room_for_delays(

@@ -11,7 +11,7 @@ import numpy as np
 from sb3_rpto.effects.actuation import GAINS, JOINTS, on_voltage
 from sb3_rpto.effects.bodies import may_touch
 from sb3_rpto.effects.names import SCALAR_JOINTS, object_names
-from sb3_rpto.sysid.data.signal_quality import Finding, listed
+from sb3_rpto.sysid.findings import Finding, FindingKind, Hint, listed
 from sb3_rpto.sysid.settings import DEFAULTS
 
 _JOINTS = {int(mujoco.mjtJoint.mjJNT_BALL): "ball joint", int(mujoco.mjtJoint.mjJNT_FREE): "free joint"}
@@ -47,18 +47,6 @@ class Thing:
 
     def __str__(self) -> str:
         return f"{self.kind} {self.name}"
-
-
-@dataclass(frozen=True)
-class Hint(Finding):
-    """What may be wrong instead where nothing explains recordings.
-
-    :param bodies: that it concerns; None: all
-    :param left: share of the error that is left with it; infinite where that was not tried
-    """
-
-    bodies: frozenset[int] | None = None
-    left: float = np.inf
 
 
 def unreached(model: mujoco.MjModel) -> list[Thing]:
@@ -108,7 +96,7 @@ def mocap_bodies(model: mujoco.MjModel) -> list[Finding]:
             "its pose is in no column: it is taken to stand still where the model puts it, "
             f"and {_hold(model, thing)}; where it moved, give it joints with columns of its own instead of mocap"
         )
-        found.append(Finding("mocap body", thing.name, message))
+        found.append(Finding(FindingKind.MOCAP_BODY, thing.name, message))
     return found
 
 
@@ -129,7 +117,7 @@ def _finding(things: Sequence[Thing]) -> Finding:
         "is named besides may only stand in for it. Compare its numbers in the MJCF with the machine's, or model it "
         "by hinges, slides and motors"
     )
-    return Finding("beyond the library", "the model", message)
+    return Finding(FindingKind.BEYOND_THE_LIBRARY, "the model", message)
 
 
 def _joints(model: mujoco.MjModel) -> list[Thing]:

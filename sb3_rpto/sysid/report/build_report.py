@@ -11,7 +11,7 @@ from sb3_rpto.effects import Declared, Effect
 from sb3_rpto.effects.model import file_of
 from sb3_rpto.effects.units import units_at
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding, grouped
+from sb3_rpto.sysid.findings import Finding, FindingKind, grouped
 from sb3_rpto.sysid.hypotheses.alternatives import hints
 from sb3_rpto.sysid.problem.inverse_dynamics import ForceResidual, learnable_share, summary
 from sb3_rpto.sysid.problem.missing_force import missing_forces
@@ -34,7 +34,8 @@ from sb3_rpto.sysid.report.diagnostics import (
     unstable,
     vague_noise,
 )
-from sb3_rpto.sysid.report.report import Candidate, Report, StandIn, Traced
+from sb3_rpto.sysid.report.report import Report
+from sb3_rpto.sysid.report.results import Candidate, StandIn, Traced
 from sb3_rpto.sysid.selection.adequacy import SETTLED
 from sb3_rpto.sysid.selection.confidence_intervals import FinalFit
 from sb3_rpto.sysid.selection.screening import Screening
@@ -159,11 +160,11 @@ def _about_the_search(problem: IdentificationProblem, result: SearchResult) -> l
             f"judged with steps of {step:g} ms: longer ones err by a good part of what is left (dry friction and "
             "contacts are kinks); the corrected simulator errs less with a smaller timestep, too"
         )
-        found.append(Finding("time step", "model", message))
+        found.append(Finding(FindingKind.TIME_STEP, "model", message))
     if selector.select is None:
         count = len(selector.train.windows)
         message = f"selected on {count} windows of the training runs by cross-validation over blocks"
-        found.append(Finding("split", "training runs", message))
+        found.append(Finding(FindingKind.SPLIT, "training runs", message))
     return found
 
 

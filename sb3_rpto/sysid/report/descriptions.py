@@ -163,11 +163,3 @@ def equation(effects: Sequence[Effect]) -> str:
 def percent(share: float) -> str:
     """A share in per cent."""
     return f"{100 * share:.0f} %" if np.isfinite(share) else "–"
-
-
-def aligned(rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
-    """Lines of a table whose columns stand under each other."""
-    if not rows:
-        return []
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return [indent + "  ".join(cell.ljust(w) for cell, w in zip(row, widths)).rstrip() for row in rows]

@@ -12,7 +12,7 @@ from sb3_rpto.effects import Declared, Effect, Scales, Simulation
 from sb3_rpto.effects.actuation import servo_of
 from sb3_rpto.effects.units import joint_of
 from sb3_rpto.sysid.data.measurements import Measurements
-from sb3_rpto.sysid.data.signal_quality import Finding, listed
+from sb3_rpto.sysid.findings import Finding, FindingKind, listed
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
 from sb3_rpto.sysid.report import descriptions
 from sb3_rpto.sysid.selection.adequacy import Adequacy
@@ -74,7 +74,7 @@ def missed(
         "that it was fitted to: a test run differs (a moved sensor, another load), or moves as none of those did; the "
         "verdict is about those"
     )
-    return [Finding("missed", listed(runs), message, tuple(runs))]
+    return [Finding(FindingKind.MISSED, listed(runs), message, tuple(runs))]
 
 
 def _from_fitted_starts(
@@ -104,7 +104,7 @@ def above_noise(after: list[HorizonError], floor: list[HorizonError], ratio: flo
         f"R is {ratio:.2f}, and in {clear[0].horizon:g} s the test runs err clearly more than noise leaves: so few "
         "windows cannot rule out that something small is missing, or that what is named stands in for it; record more"
     )
-    return [Finding("few windows", "test runs", message)]
+    return [Finding(FindingKind.FEW_WINDOWS, "test runs", message)]
 
 
 def vague_noise(after: Adequacy, data: Measurements) -> list[Finding]:
@@ -120,7 +120,7 @@ def vague_noise(after: Adequacy, data: Measurements) -> list[Finding]:
         "passes for noise, as after commands that change every few of them, and what is missing may hide below it; "
         "sample faster, or hold commands for more samples"
     )
-    return [Finding("vague noise", "fitted runs", message)]
+    return [Finding(FindingKind.VAGUE_NOISE, "fitted runs", message)]
 
 
 def strays(
@@ -151,7 +151,7 @@ def strays(
             )
             if after.denied_by_strays:
                 message += "; such windows alone deny that the model accounts for the data: see what happens there"
-            kind, where = "stray windows", "fitted runs"
+            kind, where = FindingKind.STRAY_WINDOWS, "fitted runs"
             found.append(Finding.of_run(kind, run, "", message) if run else Finding(kind, where, message))
     return found
 
@@ -170,7 +170,7 @@ def undetermined(problem: Problem, values: np.ndarray, intervals: np.ndarray) ->
                 f"{value:.4g} {descriptions.interval(low, high)}: these data do not tell it; move so that it matters, "
                 f"do not {'declare it, or declare' if is_number else 'give it, or give'} fewer that act alike"
             )
-            found.append(Finding("undetermined", where, message))
+            found.append(Finding(FindingKind.UNDETERMINED, where, message))
     return found
 
 
@@ -197,7 +197,7 @@ def at_bounds(problem: Problem, values: np.ndarray, named: Sequence[int]) -> lis
         else:
             where = f"{effect.label}, {parameter.name}"
             message += "the machine may lie beyond, or it stands in for something else"
-        found.append(Finding("at its bound", where, message))
+        found.append(Finding(FindingKind.AT_ITS_BOUND, where, message))
     return found
 
 
@@ -232,7 +232,7 @@ def own_steps(
         f"astray in {horizon:g} s at {observed(data)[worst]}, where the noise is {noise[worst]:.2g}; the errors "
         'after are of finer ones: integrator="RK4" or a shorter timestep in the MJCF\'s <option> keeps them'
     )
-    return [Finding("own steps", "corrected simulator", message)]
+    return [Finding(FindingKind.OWN_STEPS, "corrected simulator", message)]
 
 
 def no_nearer(before: Sequence[HorizonError], after: Sequence[HorizonError]) -> list[Finding]:
@@ -246,7 +246,7 @@ def no_nearer(before: Sequence[HorizonError], after: Sequence[HorizonError]) -> 
         f"predicted worse with what is listed (worst for {b.joints[worst]}, {b.horizon:g} s ahead: {b.rmse[worst]:.3g} "
         f"before, {a.rmse[worst]:.3g} after): it stands in for something else; do not use the corrected simulator"
     )
-    return [Finding("no nearer", "test runs", message)]
+    return [Finding(FindingKind.NO_NEARER, "test runs", message)]
 
 
 def encoder_zeros(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Finding]:
@@ -269,7 +269,7 @@ def encoder_zeros(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Findin
             f"{'m' if model.jnt_type[joint] == SLIDE else 'rad'} look like this, too, with nothing wrong with the "
             "torque; check the zeros"
         )
-        found.append(Finding("encoder zero", effect.label, message))
+        found.append(Finding(FindingKind.ENCODER_ZERO, effect.label, message))
     return found
 
 
@@ -285,7 +285,7 @@ def tied_sensors(model: mujoco.MjModel, named: Sequence[Effect]) -> list[Finding
         "numbers beside them lie outside of their intervals; check the tie"
     )
     return [
-        Finding("tied sensor", effect.label, message)
+        Finding(FindingKind.TIED_SENSOR, effect.label, message)
         for effect in named
         if effect.overrides("observe") and joint_of(effect, model) in tied
     ]
@@ -297,7 +297,7 @@ def idle_start(late: Sequence[Effect]) -> list[Finding]:
     :param late: effects that are so
     """
     message = "the runs begin as if zeros had been sent before, and so do episodes of the corrected simulator"
-    return [Finding("idle start", ", ".join(e.label for e in late), message)] if late else []
+    return [Finding(FindingKind.IDLE_START, ", ".join(e.label for e in late), message)] if late else []
 
 
 def brief_delays(named: Sequence[Effect], step: float) -> list[Finding]:
@@ -313,7 +313,7 @@ def brief_delays(named: Sequence[Effect], step: float) -> list[Finding]:
                 f"{1e3 * delay:.2g} ms are {delay / step:.1%} of the {1e3 * step:.3g} ms between two samples: time "
                 f"stamps that are late by as much look like this, and a simulator that steps {2e3 * delay:.2g} ms"
             )
-            found.append(Finding("brief delay", effect.label, message))
+            found.append(Finding(FindingKind.BRIEF_DELAY, effect.label, message))
     return found
 
 
@@ -323,7 +323,7 @@ def too_short(errors: list[HorizonError], data: Measurements) -> list[Finding]:
         return []
     length = 1e3 * max((float(np.ptp(e.time)) for e in data.episodes), default=0.0)
     message = f"no error on unseen runs: the longest stretch of theirs has {length:.3g} ms; set longer runs apart"
-    return [Finding("split", "test runs", message)]
+    return [Finding(FindingKind.SPLIT, "test runs", message)]
 
 
 def unstable(problem: Problem, before: np.ndarray, after: np.ndarray) -> list[Finding]:
@@ -336,5 +336,5 @@ def unstable(problem: Problem, before: np.ndarray, after: np.ndarray) -> list[Fi
         count = problem.unstable(values)
         if count:
             message = f"in {count} of {len(problem.windows)} the {which} model became unstable; {remedy}"
-            found.append(Finding("unstable", "fitted windows", message))
+            found.append(Finding(FindingKind.UNSTABLE, "fitted windows", message))
     return found

@@ -12,15 +12,15 @@ import pytest
 
 from sb3_rpto.effects.effect import LIBRARY
 from sb3_rpto.sysid import Finding, Report
-from sb3_rpto.sysid.data.measurements import Noise
-from sb3_rpto.sysid.report import descriptions, figures, residual_plots
-from sb3_rpto.sysid.report.html import render
-from sb3_rpto.sysid.report.report import Candidate
+from sb3_rpto.sysid.data.recording import Noise
+from sb3_rpto.sysid.findings import FindingKind
+from sb3_rpto.sysid.report import descriptions, figures
+from sb3_rpto.sysid.report.results import Candidate
 
 
 @pytest.fixture(scope="module")
 def page(report: Report) -> str:
-    return render(report)
+    return report.html()
 
 
 class Reader(HTMLParser):
@@ -60,9 +60,9 @@ class Reader(HTMLParser):
 @pytest.mark.slow
 def test_known_noise_is_listed_of_velocities_too(report: Report) -> None:
     joints = report.data.columns.qvel
-    assert f"{joints[0]}, velocity" not in Reader(render(report)).cells
+    assert f"{joints[0]}, velocity" not in Reader(report.html()).cells
     noise = Noise(np.full(len(report.data.columns.qpos), 0.001), np.linspace(0.0125, 0.0225, len(joints)))
-    cells = Reader(render(replace(report, data=replace(report.data, noise=noise)))).cells
+    cells = Reader(replace(report, data=replace(report.data, noise=noise)).html()).cells
     at = cells.index(f"{joints[0]}, velocity")
     assert cells[at + 1 : at + 3] == ["0.0125", "rad/s"]
 
@@ -108,8 +108,8 @@ def test_numbers_are_those_of_the_report(page: str, report: Report) -> None:
     assert cells[at + 5] == descriptions.number(after.rmse[0])
     assert cells[at + 7] == descriptions.number(floor.rmse[0])
     for candidate in report.candidates:
-        at = cells.index(candidate.label)
-        assert cells[at + 1 : at + 3] == [candidate.status, candidate.reason]
+        row = [candidate.label, candidate.status, candidate.reason]
+        assert any(cells[at : at + 3] == row for at in range(len(cells)))
 
 
 def test_every_section_and_the_verdict_are_there(page: str, report: Report) -> None:
@@ -125,32 +125,30 @@ def test_every_section_and_the_verdict_are_there(page: str, report: Report) -> N
 
 @pytest.mark.parametrize("verdict", ["explained", "partly explained", "unexplained"])
 def test_only_an_explanation_is_claimed(report: Report, verdict: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (residual_plots, figures):
-        monkeypatch.setattr(module, "draw", lambda *_: "data:image/svg+xml;base64,")
-    words = "".join(Reader(render(replace(report, verdict=verdict))).words)
+    monkeypatch.setattr(figures, "draw", lambda *_: "data:image/svg+xml;base64,")
+    words = "".join(Reader(replace(report, verdict=verdict).html()).words)
     assert ("not claimed as the explanation" in words) == (verdict != "explained")
 
 
 @pytest.mark.slow
 def test_the_same_report_gives_the_same_page(page: str, report: Report) -> None:
-    assert render(report) == page
+    assert report.html() == page
 
 
 def test_names_of_users_cannot_break_the_page(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (residual_plots, figures):
-        monkeypatch.setattr(module, "draw", lambda *_: "data:image/svg+xml;base64,")
+    monkeypatch.setattr(figures, "draw", lambda *_: "data:image/svg+xml;base64,")
     evil = '<script>alert("x")</script>&'
     other = replace(
         report,
         candidates=[Candidate(evil, "dropped", evil, 1.0, [evil])],
-        findings=[Finding(evil, evil, evil)],
+        findings=[Finding(FindingKind.GAP, evil, evil)],
         runs={"train": [evil], "select": [], "test": [evil]},
         noise={"hinge": 1e-3},
         effects=[replace(report.effects[0], alike=[evil])],
         before=[replace(e, joints=(evil,)) for e in report.before],
         after=[replace(e, joints=(evil,)) for e in report.after],
     )
-    page = render(other)
+    page = other.html()
     assert "<script" not in page
     reader = Reader(page)
     assert not reader.open
@@ -163,22 +161,21 @@ def test_dollars_in_names_are_no_formulas(report: Report) -> None:
 
 
 def test_without_effects_the_usual_causes_are_shown(report: Report) -> None:
-    reader = Reader(render(replace(report, effects=[], verdict="complete", findings=[], candidates=[])))
+    reader = Reader(replace(report, effects=[], verdict="complete", findings=[], candidates=[]).html())
     assert any("its possible causes" in image["alt"] for image in reader.images)
     assert "No effect was needed" in "".join(reader.words)
 
 
 def test_without_test_runs_the_page_says_so(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (residual_plots, figures):
-        monkeypatch.setattr(module, "draw", lambda *_: "data:image/svg+xml;base64,")
+    monkeypatch.setattr(figures, "draw", lambda *_: "data:image/svg+xml;base64,")
     other = replace(report, runs={**report.runs, "test": []})
-    assert "There are no test runs" in "".join(Reader(render(other)).words)
+    assert "There are no test runs" in "".join(Reader(other.html()).words)
     assert "no test runs" in str(other)
 
 
 def test_without_this_effect_alone_its_own_force_is_what_is_missing(report: Report) -> None:
     (found,) = report.effects
-    without = residual_plots._without(report, found.effect)
+    without = figures.residuals_without(report, found.effect)
     speed = np.concatenate([r.qvel[:, 0] for r in without])
     force = np.concatenate([r.force[:, 0] for r in without])
     for sign in (-1, 1):
@@ -189,19 +186,19 @@ def test_without_this_effect_alone_its_own_force_is_what_is_missing(report: Repo
 def test_medians_follow_the_data() -> None:
     x = np.linspace(-1, 1, 4001)
     noise = np.random.default_rng(0).standard_cauchy(len(x)) * 0.01
-    centre, median = residual_plots.binned_medians(x, np.sign(x) + noise)
+    centre, median = figures.binned_medians(x, np.sign(x) + noise)
     away = np.abs(centre) > 0.1
     np.testing.assert_allclose(median[away], np.sign(centre[away]), atol=0.01)
 
 
 def test_every_effect_of_the_library_has_a_cause() -> None:
     for kind, effect in LIBRARY.items():
-        assert effect.place in residual_plots.BY_PLACE, kind
-    assert set(residual_plots.CAUSES) <= set(LIBRARY)
-    assert set(residual_plots.LEVELS) <= set(residual_plots.CAUSES)
+        assert effect.place in figures.BY_PLACE, kind
+    assert set(figures.CAUSES) <= set(LIBRARY)
+    assert set(figures.LEVELS) <= set(figures.CAUSES)
 
 
 def test_without_matplotlib_the_extra_is_named(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ImportError, match=r"pip install -e '.\[tracing\]'"):
-        render(report)
+        report.html()
