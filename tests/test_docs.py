@@ -78,10 +78,11 @@ def test_links_lead_somewhere(page):
 
 @by_page
 def test_what_is_named_exists(page):
-    """``folder/file.py:name`` is defined in that file of the package, ``test_name`` in the tests."""
+    """``folder/file.py:name`` is defined in that file of the package or the benchmarks, ``test_name`` in the tests."""
     for path, name in re.findall(r"`([\w/]+\.py):([\w.]+)`", prose(page)):
-        assert (ROOT / "sb3_rpto" / path).exists(), path
-        source = (ROOT / "sb3_rpto" / path).read_text()
+        file = ROOT / ("" if path.startswith("benchmarks/") else "sb3_rpto") / path
+        assert file.exists(), path
+        source = file.read_text()
         for part in name.split("."):
             assert re.search(rf"^\s*(def|class) {part}\b|^\s*{part}\b.*=", source, re.MULTILINE), f"{path}:{name}"
     tests = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
@@ -226,7 +227,7 @@ def test_the_table_of_declared_parameters_is_what_can_be_declared():
 
 
 def test_every_kind_of_finding_is_in_the_table():
-    source = "\n".join(p.read_text() for p in (ROOT / "sb3_rpto" / "tracing").glob("*.py"))
+    source = "\n".join(p.read_text() for p in (ROOT / "sb3_rpto" / "sysid").rglob("*.py"))
     kinds = set(re.findall(r'(?:Finding|\bsay)\(\s*"([a-z ]+)"', source))
     assert len(kinds) > 30
     page = (ROOT / "docs" / "measurements.md").read_text()

@@ -13,9 +13,9 @@ from typing import Any
 import pandas as pd
 import torch as th
 from tqdm import tqdm
-from transfer_double_pendulum import source, source_policy, target
 
 from benchmarks import RESULTS
+from examples.transfer_double_pendulum import source, source_policy, target
 from sb3_rpto.baselines.transfer import transfer
 from sb3_rpto.evaluation.statistics import summarise
 

@@ -130,7 +130,7 @@ def _once(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _result(file: Path) -> list[dict[str, Any]] | None:
-    """The rows of a file of ``sb3-rpto transfer``, ``train`` or ``benchmark transfer``; None for another file."""
+    """The rows of a result of ``sb3-rpto transfer`` or ``train``, or of a benchmark; None for another file."""
     from sb3_rpto.envs.tasks import env_id
 
     try:

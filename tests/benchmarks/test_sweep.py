@@ -21,10 +21,11 @@ import pytest
 from stable_baselines3 import SAC
 from tiny_suite import PLACE, SUITE, returns, run_here, stored
 
+from benchmarks.__main__ import main
 from benchmarks.transfer import sources, sweep, tables
 from benchmarks.transfer.plan import Place, Variant, jobs
 from benchmarks.transfer.suites import SMOKE, SUITES
-from sb3_rpto import RPTO, cli
+from sb3_rpto import RPTO
 from sb3_rpto.baselines.slbo import SLBO
 from sb3_rpto.buffers import load_transitions
 from sb3_rpto.evaluation.provenance import constructor_arguments
@@ -175,7 +176,7 @@ def test_a_failed_run_is_kept_said_and_does_not_stop_the_others(
 ) -> None:
     broken = replace(PLACE, variants=(*PLACE.variants, Variant("broken", "slbo", {"iterations": 0}, seeds=1)))
     monkeypatch.setitem(SUITES, "smoke", replace(SUITE, places=(broken,)))
-    assert cli.main(["benchmark", "transfer", "--suite", "smoke", "--out", str(tmp_path), "--workers", "1"]) == 1
+    assert main(["transfer", "--suite", "smoke", "--out", str(tmp_path), "--workers", "1"]) == 1
     said = capsys.readouterr()
     assert "4 of 5 runs are done" in said.out
     assert "_broken_0 failed: ValueError: iterations must be a positive integer" in said.err
@@ -233,7 +234,7 @@ def test_the_manifest_is_what_a_report_needs(made: Path) -> None:
     reference = manifest["references"]["ContinuousCartPole_limb-x2"]
     assert reference["oracle"] >= reference["zero_shot"]
     assert reference["steps"] == PLACE.oracle_steps
-    assert cli.main(["benchmark", "report", str(made)]) == 0
+    assert main(["transfer", "report", str(made)]) == 0
 
 
 def test_all_arguments_of_an_algorithm_are_read_off_it() -> None:
@@ -319,7 +320,7 @@ def test_list_prints_runs_and_costs_and_starts_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     arguments = ["--suite", "quick", "--only", "InvertedDouble.*rpto", "--seeds", "2", "--workers", "2", "--list"]
-    assert cli.main(["benchmark", "transfer", *arguments]) == 0
+    assert main(["transfer", *arguments]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 * 3 + 1
     assert "min on 2 cores" in lines[-1]

@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks.__main__ import main
 from benchmarks.transfer import plan, tables
 from benchmarks.transfer.plots import learning_curves
-from sb3_rpto import cli
 from sb3_rpto.evaluation import statistics
 
 # --- statistics -----------------------------------------------------------------------------------------------------
@@ -181,7 +181,7 @@ def test_first_on_how_many_targets(folder: Path) -> None:
 
 
 def test_everything_is_written_beside_the_manifest(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["benchmark", "report", str(folder)]) == 0
+    assert main(["transfer", "report", str(folder)]) == 0
     text = (folder / "report.md").read_text()
     assert capsys.readouterr().out.strip() == text.strip()
     assert "8 of 10 runs are done" in text
@@ -283,7 +283,7 @@ def test_a_factorial_suite_reports_its_factors(folder: Path) -> None:
 def test_no_results_are_bad_input(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for file in (folder / "runs").glob("*.json"):
         file.unlink()
-    assert cli.main(["benchmark", "report", str(folder)]) == 2
+    assert main(["transfer", "report", str(folder)]) == 2
     assert "no run is done" in capsys.readouterr().err
-    assert cli.main(["benchmark", "report", str(folder / "absent")]) == 2
-    assert "benchmark transfer" in capsys.readouterr().err
+    assert main(["transfer", "report", str(folder / "absent")]) == 2
+    assert "benchmarks transfer" in capsys.readouterr().err
