@@ -6,24 +6,31 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-#: By study and part, the module whose ``main(arguments)`` runs it; "" is what runs where no part is named.
+#: By study and part, the module whose ``main(arguments)`` runs it, or ``module:function``; "" is what runs where no
+#: part is named.
 STUDIES: dict[str, dict[str, str]] = {
     "tracing": {
-        "": "benchmarks.tracing",
+        "": "benchmarks.tracing.run",
+        "report": "benchmarks.tracing.table",
         "encoders": "benchmarks.tracing.encoders",
-        "robots": "benchmarks.tracing.gymnasium_robots",
+        "robots": "benchmarks.tracing.robots",
         "shapes": "benchmarks.tracing.shapes",
         "targets": "benchmarks.tracing.targets",
         "threshold": "benchmarks.tracing.threshold",
     },
     "transfer": {
         "": "benchmarks.transfer.sweep",
-        "cartpole": "benchmarks.transfer.cartpole_panels",
-        "double_pendulum": "benchmarks.transfer.double_pendulum_ablation",
-        "pictures": "benchmarks.transfer.render_targets",
+        "cartpole": "benchmarks.transfer.cartpole",
+        "panels": "benchmarks.transfer.cartpole:draw",
+        "double_pendulum": "benchmarks.transfer.double_pendulum",
+        "pictures": "benchmarks.transfer.pictures",
         "report": "benchmarks.transfer.tables",
     },
-    "closed_loop": {"": "benchmarks.closed_loop.run", "retraining": "benchmarks.closed_loop.retraining_ablation"},
+    "closed_loop": {
+        "": "benchmarks.closed_loop.run",
+        "report": "benchmarks.closed_loop.run:report_table",
+        "retraining": "benchmarks.closed_loop.retraining",
+    },
     "speed": {"": "benchmarks.speed"},
     "machines": {"": "benchmarks.machines.run"},
     "theory": {"": "benchmarks.theory.table"},
@@ -48,8 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     part = rest.pop(0) if rest and rest[0] in parts else ""
     traceback = "--traceback" in rest
     try:
-        study = importlib.import_module(parts[part])
-        return int(study.main([option for option in rest if option != "--traceback"]) or 0)
+        module, _, function = parts[part].partition(":")
+        run = getattr(importlib.import_module(module), function or "main")
+        return int(run([option for option in rest if option != "--traceback"]) or 0)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED

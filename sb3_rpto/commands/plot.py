@@ -139,7 +139,8 @@ def _result(file: Path) -> list[dict[str, Any]] | None:
             print(f"sb3-rpto: left out, learned from a log, so that there is no curve: {file}", file=sys.stderr)
             return None
         if "job" in content:  # of the benchmark: a method with its settings has a label
-            shifted = env_id(content["job"]["task"], content["target"]["shift"])  # as of ``transfer``
+            shift = content.get("target", content["job"]).get("shift", content["job"].get("target"))
+            shifted = env_id(content["job"]["task"], shift)  # as of ``transfer``
             of_run = {"method": content["job"]["label"], "target": shifted, "seed": content["job"]["seed"]}
             known = {name: content["job"].get(name) for name in ("settings", "episodes")}
             known["source"] = env_id(content["job"]["task"])
