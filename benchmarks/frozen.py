@@ -8,19 +8,19 @@ Bits depend on the processor and on torch: record the table from the commit befo
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch as th
-from tqdm import tqdm
 
 from benchmarks import RESULTS
+from benchmarks.runner import Row, chosen, parser_of, run_jobs
 from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.effects import LIBRARY
@@ -49,9 +49,16 @@ def target() -> gym.Env:
     return apply_effects(env, [LIBRARY["coulomb_friction"]("slider", level=10.0)])
 
 
-def frozen(name: str) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Job:
+    """A run by its name."""
+
+    name: str
+
+
+def frozen(job: Job) -> list[Row]:
     """One run: its target steps, and number, norm and digest of its parameters."""
-    cls, settings = RUNS[name]
+    cls, settings = RUNS[job.name]
     network = {"net_arch": [32, 32]}
     model = cls(
         "MlpPolicy",
@@ -72,31 +79,37 @@ def frozen(name: str) -> dict[str, Any]:
     numbers += [np.asarray(v, np.float64).ravel() for v in dynamics.values() if isinstance(v, th.Tensor | np.ndarray)]
     row = np.concatenate([n.astype(np.float64) for n in numbers])
     digest = hashlib.sha256(row.tobytes()).hexdigest()[:16]
-    return {
-        "run": name,
-        "target_steps": model.num_timesteps,
-        "parameters": len(row),
-        "norm": f"{np.linalg.norm(row):.10g}",
-        "sha256": digest,
-    }
+    counts = {"target_steps": model.num_timesteps, "parameters": len(row)}
+    return [{"run": job.name, **counts, "norm": f"{np.linalg.norm(row):.10g}", "sha256": digest}]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Record or compare."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Record or compare.
+
+    :param arguments: without the study's name; default: those of the process
+    :return: exit code, 1 where parameters are others
+    """
+    parser = parser_of("frozen", __doc__, "frozen")
     parser.add_argument("--record", action="store_true", help="write the table anew")
     asked = parser.parse_args(arguments)
-    if not (asked.record or TABLE.exists()):
+    listed = chosen([Job(name) for name in RUNS], asked.only)
+    if asked.list:
+        print(*(job.name for job in listed), sep="\n")
+        return 0
+    table = asked.out.with_name(f"{asked.out.name}.csv") if asked.out else TABLE
+    if not (asked.record or table.exists()):
         parser.error("there is no table yet: write one by --record, from the commit to compare with")
-    th.set_num_threads(1)
-    now = pd.DataFrame([frozen(name) for name in tqdm(RUNS, desc="runs")]).astype(str)
+    # One after the other in this process, unless asked otherwise: threads of others change no last digit.
+    results = run_jobs(frozen, listed, asked.runs, asked.workers or 1, asked.backend, fresh=True)
+    now = pd.DataFrame([row for result in results for row in result["rows"]]).astype(str)
     if asked.record:
-        TABLE.parent.mkdir(exist_ok=True)
-        now.to_csv(TABLE, index=False)
+        table.parent.mkdir(exist_ok=True)
+        now.to_csv(table, index=False)
         print(now.to_string(index=False))
-        return
-    then = pd.read_csv(TABLE, dtype=str)
+        return 0
+    then = pd.read_csv(table, dtype=str)
+    then = then[then["run"].isin([job.name for job in listed])]
     both = then.merge(now, on="run", how="outer", suffixes=(" then", " now"))
     same = (both["sha256 then"] == both["sha256 now"]).fillna(False)
     print(both.assign(same=same).to_string(index=False))
-    raise SystemExit(0 if same.all() else 1)
+    return 0 if same.all() else 1

@@ -18,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).resolve().parents[1]))  # the checkout, whose benchmarks simulate the robot
+
 from benchmarks.tracing.planting import KINDS, SYSTEMS, draw, generate, places
 from benchmarks.tracing.truth import as_effect, deviation, twins
 from sb3_rpto.effects import Effect

@@ -282,14 +282,6 @@ def test_no_command_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--help" in error(capsys)
 
 
-def test_options_of_a_benchmark_are_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    module = type(sys)("fake_benchmark")
-    module.main = lambda options: len(options)  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "fake_benchmark", module)
-    monkeypatch.setitem(cli.BENCHMARKS, "tracing", "fake_benchmark")
-    assert cli.main(["benchmark", "tracing", "--help", "-x", "1"]) == 3
-
-
 @pytest.mark.parametrize(
     ("command", "words"),
     [
@@ -299,7 +291,6 @@ def test_options_of_a_benchmark_are_passed_on(monkeypatch: pytest.MonkeyPatch) -
         (["plot"], "sb3-rpto plot runs/"),
         (["enjoy"], "--video hopper.mp4"),
         (["trace"], "example:"),
-        (["benchmark"], "tracing"),
     ],
 )
 def test_help_exits_with_0(command: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:

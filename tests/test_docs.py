@@ -79,10 +79,11 @@ def test_links_lead_somewhere(page):
 
 @by_page
 def test_what_is_named_exists(page):
-    """``folder/file.py:name`` is defined in that file of the package, ``test_name`` in the tests."""
+    """``folder/file.py:name`` is defined in that file of the package or the benchmarks, ``test_name`` in the tests."""
     for path, name in re.findall(r"`([\w/]+\.py):([\w.]+)`", prose(page)):
-        assert (ROOT / "sb3_rpto" / path).exists(), path
-        source = (ROOT / "sb3_rpto" / path).read_text()
+        file = ROOT / ("" if path.startswith("benchmarks/") else "sb3_rpto") / path
+        assert file.exists(), path
+        source = file.read_text()
         for part in name.split("."):
             assert re.search(rf"^\s*(def|class) {part}\b|^\s*{part}\b.*=", source, re.MULTILINE), f"{path}:{name}"
     tests = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))

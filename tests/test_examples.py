@@ -17,6 +17,7 @@ from sb3_rpto.effects.corrected_model_io import load_corrected
 from sb3_rpto.sysid import Measurements
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+STARTS = {"quickstart_pendulum", "close_the_loop", "robot_log_to_policy", "trace_robot", "transfer_double_pendulum"}
 SMALL = ["--episodes", "6", "--duration", "2.5"]
 
 
@@ -126,7 +127,7 @@ def test_close_the_loop_names_what_is_in_the_target(monkeypatch, tmp_path, capsy
     few = ["--steps", "202", "--retrain-steps", "25"]
     monkeypatch.setattr(sys, "argv", ["close_the_loop.py", *few, "--out", str(tmp_path)])
     example.main()
-    true = {effect.label: effect.values for effect in example.shifted("double-pendulum", "undeclared", 0)}
+    true = {effect.label: effect.values for effect in example.unknown(0)}
     found = {effect.label: effect.values for effect in load_corrected(tmp_path).effects}
     assert set(found) == set(true)
     assert all(found[label] == pytest.approx(true[label], rel=0.01) for label in true)
@@ -142,26 +143,10 @@ def test_close_the_loop_names_what_is_in_the_target(monkeypatch, tmp_path, capsy
     assert (tmp_path / "closed_loop.png").exists()
 
 
+def test_examples_are_those_that_a_user_would_start_from():
+    assert {path.stem for path in EXAMPLES.iterdir() if path.suffix} == STARTS
+
+
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py")))
 def test_examples_say_how_they_are_run(name):
     assert f"python examples/{name}" in (EXAMPLES / name).read_text()
-
-
-def test_a_killed_training_of_a_source_policy_leaves_none(monkeypatch, tmp_path):
-    panels = load("cartpole_panels", monkeypatch)
-    monkeypatch.setitem(panels.SAC_SETTINGS, "learning_starts", 10**6)
-    seen = iter([20.0, 30.0, KeyboardInterrupt, *[10.0] * 20, 600.0, 600.0])
-
-    def evaluated(*_):
-        found = next(seen)
-        if found is KeyboardInterrupt:
-            raise found
-        return found
-
-    monkeypatch.setattr(panels, "evaluate", evaluated)
-    monkeypatch.setattr(panels.SAC, "learn", lambda self, *_, **__: self)
-    with pytest.raises(KeyboardInterrupt):
-        panels.source_policy(tmp_path, 0)
-    assert Path(panels.source_policy(tmp_path, 0)).name == "source_0.zip"
-    assert next(seen, "none") == "none", "it was trained anew, to the end"
-    assert panels.source_policy(tmp_path, 0) == str(tmp_path / "source_0.zip")

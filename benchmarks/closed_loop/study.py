@@ -14,18 +14,19 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-import torch as th
 from gymnasium import spaces
 
+from benchmarks.runner import Result, Row, rows_of
 from benchmarks.transfer import sources
+from benchmarks.transfer.shared_dynamics import fit_once
+from benchmarks.transfer.statistics import enough, steps_to
 from sb3_rpto.baselines.domain_randomization import randomised_agent
 from sb3_rpto.baselines.transfer import transfer
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.simulator import physical_config
 from sb3_rpto.effects import LIBRARY, Declared, Effect, declare
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.evaluation.provenance import commit
-from sb3_rpto.evaluation.statistics import enough, steps_to, stratified_interval
+from sb3_rpto.evaluation.statistics import stratified_interval
 from sb3_rpto.files import write_json
 
 SHIFTS = ("declared", "undeclared", "none")
@@ -100,6 +101,9 @@ METHODS: dict[str, tuple[str, tuple[int, ...], dict[str, Any]]] = {
     # Before its first target step it is what domain randomisation makes of the source's policy.
     "randomised, SAC-warm": ("sac-warm", SHORT, {"gradient_steps": 1}),
 }
+#: SAC, fine-tuned long in the target, seed 0: the best of its evaluations says what could be reached.
+ORACLE = "oracle"
+ORACLE_POINTS = tuple(range(ORACLE_STEPS // 10, ORACLE_STEPS + 1, ORACLE_STEPS // 10))
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,8 @@ class Job:
 
     :param sensors: standard deviation of the noise with which the target's positions are observed, in rad or m, and ten
         times as many rad/s or m/s of the speeds; a closed loop is told
+    :param budget: at most so many target steps, but for the oracle; None: the study's
+    :param episodes: of an evaluation
     """
 
     task: str
@@ -116,20 +122,41 @@ class Job:
     method: str
     seed: int
     sensors: float = 0.0
+    budget: int | None = None
+    episodes: int = EPISODES
 
     @property
     def name(self) -> str:
-        """Of its result file."""
+        """Of its result."""
         place = (self.task, self.shift, self.target, self.method, self.seed)
         told = (*place, f"sensors-{self.sensors:g}") if self.sensors else place
         return "_".join(map(str, told)).replace(" ", "-").replace(",", "")
 
+    @property
+    def points(self) -> tuple[int, ...]:
+        """Target steps at which the policy is evaluated, beside 0."""
+        if self.method == ORACLE:
+            return ORACLE_POINTS
+        points = METHODS[self.method][1]
+        within = tuple(p for p in points if self.budget is None or p <= self.budget)
+        return within or ((self.budget,) if points and self.budget else ())
+
+    def to_json(self) -> Row:
+        """What a kept result must agree with: one of a larger budget will do, see :func:`long_enough`."""
+        return {name: value for name, value in asdict(self).items() if name not in ("budget", "episodes")}
+
+
+def long_enough(job: Job, result: Result) -> bool:
+    """Whether a result is not of a smaller budget than its job now has."""
+    return bool(result["rows"][-1]["steps"] >= max(job.points, default=0))
+
 
 def jobs(
-    tasks: Sequence[str], shifts: Sequence[str], targets: Sequence[int], seeds: Sequence[int], sensors: float = 0.0
+    tasks: Sequence[str], shifts: Sequence[str], targets: Sequence[int], seeds: Sequence[int], **settings: Any
 ) -> list[Job]:
-    """All runs, seed by seed, so that an unfinished study is a fair sample.
+    """All runs but the oracles, seed by seed, so that an unfinished study is a fair sample.
 
+    :param settings: further ones of :class:`Job`
     :raises ValueError: an unknown task or shift
     """
     for name, given, known in (("tasks", tasks, tuple(TASKS)), ("shifts", shifts, SHIFTS)):
@@ -137,7 +164,7 @@ def jobs(
         if unknown:
             raise ValueError(f"{name}: {sorted(unknown)} do not exist; choose from {known}")
     places = product(seeds, tasks, shifts, targets, METHODS)
-    return [Job(task, shift, target, method, seed, sensors) for seed, task, shift, target, method in places]
+    return [Job(task, shift, target, method, seed, **settings) for seed, task, shift, target, method in places]
 
 
 def shifted(task: str, shift: str, target: int) -> list[Effect]:
@@ -228,26 +255,18 @@ def source_agent(task: str, folder: Path) -> tuple[str, str | None]:
     return agent, data
 
 
-def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISODES) -> Path:
-    """One run; its result file is written whole, so a killed study goes on where it stopped.
+def run(job: Job, folder: Path) -> list[Row]:
+    """One run.
 
     :param job: which
-    :param folder: for result files, source agents and oracles
-    :param budget: at most so many target steps; None: the study's
-    :param episodes: of an evaluation
+    :param folder: of source agents and fits that runs share
     """
-    path = folder / f"{job.name}.json"
-    method, points, settings = METHODS[job.method]
-    points = tuple(p for p in points if budget is None or p <= budget) or ((budget,) if points and budget else ())
-    if path.exists() and json.loads(path.read_text())[-1]["steps"] >= max(points, default=0):
-        return path  # else it is of a smaller budget
-    th.set_num_threads(1)
-    made_by = commit()  # a checkout may move on while this runs
     agent, data = source_agent(job.task, folder)
     before: dict[str, float] = {}
     if job.method.startswith("randomised"):
         agent, before = _randomised(job, agent, folder)
     target = partial(make_target, job.task, job.shift, job.target, job.sensors, job.seed)
+    method, _, settings = ("sac-warm", (), {}) if job.method == ORACLE else METHODS[job.method]
     kwargs: dict[str, Any] = dict(settings)
     if method == "rpto":
         kwargs["source_data"] = data
@@ -262,17 +281,16 @@ def run(job: Job, folder: Path, budget: int | None = None, episodes: int = EPISO
         agent,
         partial(make_source, job.task),
         target,
-        max(points, default=0),
-        every=points,
+        max(job.points, default=0),
+        every=job.points,
         seed=job.seed,
-        n_episodes=episodes,
+        n_episodes=job.episodes,
         read=partial(_read, job.task, truth),
-        models=folder,
+        before_learning=partial(fit_once, folder=folder),
         **kwargs,
     )
     rows = [{**row, **{name: row[name] + spent for name, spent in before.items()}} for row in rows]
-    write_json(path, [{**row, **asdict(job), "commit": made_by} for row in rows])
-    return path
+    return [{**row, "method": job.method} for row in rows]  # not that of the registry
 
 
 def _randomised(job: Job, agent: str, folder: Path) -> tuple[str, dict[str, float]]:
@@ -312,54 +330,30 @@ def _read(task: str, truth: dict[str, float], model: Any) -> dict[str, Any]:
     return row
 
 
-def oracle(task: str, shift: str, target: int, folder: Path, steps: int = ORACLE_STEPS) -> float:
-    """Return of a SAC fine-tuned long in the target, trained once and kept; warm-started, seed 0.
-
-    :param steps: target steps
-    """
-    path = folder / f"oracle_{task}_{shift}_{target}.json"
-    if not path.exists() or json.loads(path.read_text())["steps"] != steps:
-        th.set_num_threads(1)
-        agent, _ = source_agent(task, folder)
-        rows = transfer(
-            "sac-warm",
-            agent,
-            partial(make_source, task),
-            partial(make_target, task, shift, target),
-            steps,
-            every=max(1, steps // 10),
-            n_episodes=EPISODES,
-        )
-        write_json(path, {"return": max(row["return"] for row in rows), "steps": steps})
-    return float(json.loads(path.read_text())["return"])
-
-
-def oracles(folder: Path) -> dict[tuple[str, str, int], float]:
-    """All oracles of a folder: (task, shift, target) -> return."""
-    places = product(TASKS, SHIFTS, TARGETS)
-    files = {place: folder / f"oracle_{'_'.join(map(str, place))}.json" for place in places}
-    return {place: float(json.loads(p.read_text())["return"]) for place, p in files.items() if p.exists()}
+def oracles(rows: pd.DataFrame) -> dict[tuple[str, str, int], float]:
+    """The best return of each oracle: (task, shift, target) -> return."""
+    best = rows[rows["method"] == ORACLE].groupby(["task", "shift", "target"])["return"].max()
+    return {(str(task), str(shift), int(target)): float(value) for (task, shift, target), value in best.items()}
 
 
 def collected(folder: Path, sensors: float = 0.0) -> pd.DataFrame:
-    """All rows of all finished runs whose targets were observed with this noise, see :class:`Job`."""
-    names = {m.replace(" ", "-").replace(",", "") for m in METHODS}
-    files = [p for p in sorted(folder.glob("*.json")) if any(f"_{m}_" in p.name for m in names)]
-    rows = [row for p in files for row in json.loads(p.read_text())]
-    return pd.DataFrame([row for row in rows if row.get("sensors", 0.0) == sensors])
+    """All rows of all finished runs whose targets were observed with this noise, see :class:`Job`; and oracles."""
+    results = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))]
+    rows = [row for row in rows_of(results) if row["sensors"] == sensors or row["method"] == ORACLE]
+    return pd.DataFrame(rows)
 
 
 def summary(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], float]) -> pd.DataFrame:
     """A line for each task, shift, method and number of target steps, over targets and seeds.
 
-    :param rows: of :func:`collected`
+    :param rows: of :func:`collected`; oracles are left out
     :param oracles: return of the oracle of each (task, shift, target)
     :return: IQM of the return with its 95 % interval, for which each target's runs are resampled for themselves, mean
         share of the oracle's, runs, updates and source steps per target step, seconds, median errors of the source, the
         model and its parameters, verdicts
     """
     best = pd.Series([oracles.get(key, np.nan) for key in zip(rows.task, rows["shift"], rows.target)], rows.index)
-    rows = rows.assign(share=rows["return"] / best)
+    rows = rows.assign(share=rows["return"] / best)[rows["method"] != ORACLE]
     lines = []
     for key, part in rows.groupby(["task", "shift", "method", "steps"], sort=False):
         middle, low, high = stratified_interval([of["return"].to_numpy() for _, of in part.groupby("target")])
@@ -381,7 +375,8 @@ def steps_to_oracle(rows: pd.DataFrame, oracles: dict[tuple[str, str, int], floa
 
     Targets without an oracle are left out.
     """
-    rows, lines = rows[[place in oracles for place in zip(rows.task, rows["shift"], rows.target)]], []
+    rows = rows[[place in oracles for place in zip(rows.task, rows["shift"], rows.target)]]
+    rows, lines = rows[rows["method"] != ORACLE], []
     for (task, shift, method), part in rows.groupby(["task", "shift", "method"], sort=False):
         reached = []
         for (target, _), one in part.groupby(["target", "seed"]):

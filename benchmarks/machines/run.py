@@ -1,6 +1,6 @@
 """Trace what the declared models of three real machines lack, and write tables and figures.
 
-python -m benchmarks machines --out runs/machines
+    python -m benchmarks machines --only servo
 
 The recordings are not part of the project: docs/real-machines.md says where they come from. Each machine's parameters
 and effects are chosen on its training runs alone; the test runs and the other distribution only judge them.
@@ -9,18 +9,17 @@ and effects are chosen on its training runs alone; the test runs and the other d
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import matplotlib
 import numpy as np
+import pandas as pd
 
 from benchmarks.machines.machines import MACHINES, Machine, find_measured
-from sb3_rpto.evaluation import provenance
-from sb3_rpto.files import write_json
+from benchmarks.runner import Result, Row, Study
 from sb3_rpto.sysid import Measurements, Report, trace
 from sb3_rpto.sysid.shooting.prediction_errors import MOST, HorizonError, horizon_errors, predictions
 from sb3_rpto.sysid.shooting.windows import cut
@@ -28,19 +27,16 @@ from sb3_rpto.sysid.shooting.windows import cut
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-RESULTS = Path("benchmarks/results/machines")
 
-
-def rows(name: str, data: str, model: str, errors: list[HorizonError]) -> list[dict[str, object]]:
+def rows(data: str, model: str, errors: list[HorizonError]) -> list[Row]:
     """One row for each horizon and joint, in rad."""
     return [
         {
-            "machine": name,
             "data": data,
             "model": model,
             "horizon": e.horizon,
             "joint": joint,
-            **{key: f"{getattr(e, key)[j]:.5f}" for key in ("rmse", "low", "high", "mae")},
+            **{key: round(float(getattr(e, key)[j]), 5) for key in ("rmse", "low", "high", "mae")},
             "windows": e.windows,
         }
         for e in errors
@@ -48,19 +44,18 @@ def rows(name: str, data: str, model: str, errors: list[HorizonError]) -> list[d
     ]
 
 
-def study(machine: Machine, out: Path, seed: int) -> tuple[list[dict[str, object]], dict[str, object]]:
+def study(machine: Machine, out: Path, seed: int) -> tuple[list[Row], Row]:
     """Trace one machine: error rows and what was found."""
     began = time.perf_counter()
     report = trace(machine.xml, machine.data, machine.declared, seed=seed)
     seconds = time.perf_counter() - began
     report.save(out / machine.name)
-    print(f"\n===== {machine.name}, {seconds:.0f} s\n{report}")
     models = (("declared", report.before), ("corrected", report.after), ("noise floor", report.floor))
-    found = [row for model, errors in models for row in rows(machine.name, "test", model, errors)]
+    found = [row for model, errors in models for row in rows("test", model, errors)]
     if machine.other is not None:
         for label, values in (("declared", report.values_before), ("corrected", report.values_after)):
             errors = horizon_errors(report.simulation, values, machine.other, report.sigma, seed)
-            found += rows(machine.name, "other", label, errors)
+            found += rows("other", label, errors)
     found += homed(machine, report, seed)
     found += side_by_side(machine, report)
     draw(machine, report)
@@ -76,9 +71,9 @@ def halves(data: Measurements) -> tuple[Measurements, Measurements]:
     return replace(data, episodes=first), replace(data, episodes=second)
 
 
-def homed(machine: Machine, report: Report, seed: int) -> list[dict[str, object]]:
+def homed(machine: Machine, report: Report, seed: int) -> list[Row]:
     """Errors on the second halves of runs whose encoders' zeros the corrected model tells from the first halves."""
-    found: list[dict[str, object]] = []
+    found: list[Row] = []
     for what, data in (("test", report.data), ("other", machine.other)):
         if data is None or report.zeros is None:
             continue
@@ -90,13 +85,13 @@ def homed(machine: Machine, report: Report, seed: int) -> list[dict[str, object]
         )
         for label, values, runs in models:
             errors = horizon_errors(report.simulation, values, runs, report.sigma, seed)
-            found += rows(machine.name, f"{what}, second half", label, errors)
+            found += rows(f"{what}, second half", label, errors)
     return found
 
 
-def side_by_side(machine: Machine, report: Report, horizon: float = 0.5, phases: int = 10) -> list[dict[str, object]]:
+def side_by_side(machine: Machine, report: Report, horizon: float = 0.5, phases: int = 10) -> list[Row]:
     """Errors of predictions that lie side by side, by where the first of a run begins: what that choice decides."""
-    found: list[dict[str, object]] = []
+    found: list[Row] = []
     for what, data in (("test", report.data), ("other", machine.other)):
         if data is None:
             continue
@@ -112,7 +107,7 @@ def side_by_side(machine: Machine, report: Report, horizon: float = 0.5, phases:
                 error = np.abs(difference[usable])
                 rmse, none = np.sqrt((error**2).mean(axis=0)), np.full(len(joints), np.nan)
                 pooled = HorizonError(horizon, joints, rmse, none, none, error.mean(axis=0), len(windows))
-                found += rows(machine.name, f"{what}, side by side from {start:.2f} s", label, [pooled])
+                found += rows(f"{what}, side by side from {start:.2f} s", label, [pooled])
     return found
 
 
@@ -146,30 +141,48 @@ def draw(machine: Machine, report: Report, horizon: float = 1.0) -> None:
     plt.close(figure)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("runs/machines"), help="folder of the reports")
-    parser.add_argument("--only", choices=sorted(MACHINES), action="append", help="some machines; default: all")
-    parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args(arguments)
-    folder = find_measured()
-    if folder is None:
-        parser.error("the recordings are not here; set RPTO_MEASURED to their folder (docs/real-machines.md)")
-    commit = provenance.commit()  # before results of this run make the tree another than the commit's
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    for name in asked.only or MACHINES:
-        errors, found = study(MACHINES[name](folder), asked.out, asked.seed)
-        with (RESULTS / f"{name}.csv").open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.DictWriter(stream, list(errors[0]))
-            writer.writeheader()
-            writer.writerows(errors)
-        manifest = {
-            "command": f"python -m benchmarks machines --only {name} --seed {asked.seed}",
-            "commit": commit,
-            "versions": provenance.versions(),
-            **provenance.machine(),
-            "licence": MACHINES[name](folder).licence,
-            "source": MACHINES[name](folder).source,
-            **found,
-        }
-        write_json(RESULTS / f"{name}.json", manifest)
+@dataclass(frozen=True)
+class Job:
+    """The trace of a machine."""
+
+    machine: str
+    seed: int
+
+
+def run(job: Job, folder: Path) -> Result:
+    """Trace one machine: error rows, and what was found.
+
+    :param job: which
+    :param folder: of the reports
+    """
+    measured = find_measured()
+    assert measured is not None  # as prepared
+    machine = MACHINES[job.machine](measured)
+    rows, found = study(machine, folder, job.seed)
+    return {"rows": rows, "found": {"licence": machine.licence, "source": machine.source, **found}}
+
+
+def _prepare(asked: argparse.Namespace) -> None:
+    if find_measured() is None:
+        raise FileNotFoundError(
+            "the recordings are not here; set RPTO_MEASURED to their folder (docs/real-machines.md)"
+        )
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """Errors at half a second."""
+    table = pd.DataFrame(rows)
+    shown = table[(table["horizon"] == 0.5) & table["data"].isin(["test", "other"])]
+    return shown[["machine", "data", "model", "joint", "rmse", "low", "high"]].to_string(index=False)
+
+
+main = Study(
+    "machines",
+    "machines",
+    __doc__,
+    jobs=lambda asked: [Job(name, asked.seed) for name in MACHINES],
+    run=run,
+    summary=summary,
+    options=lambda parser: parser.add_argument("--seed", type=int, default=0),
+    prepare=_prepare,
+).main

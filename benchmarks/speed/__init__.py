@@ -6,21 +6,17 @@ import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch as th
 
+from benchmarks.runner import Row, manifest, write_table
 from benchmarks.speed import cases
 from benchmarks.speed.cases import Case
 from benchmarks.speed.memory import MAKERS, peak_memory
 from benchmarks.speed.timing import flops, interleaved, products
 from sb3_rpto.dynamics.matmul_precision import pays
-from sb3_rpto.evaluation import provenance
-from sb3_rpto.files import write_json, write_text
+from sb3_rpto.files import write_json
 
-__all__ = ["add_arguments", "main", "run_benchmark"]
-
-NAME = "python -m benchmarks speed"
 #: What must hold, of ratios to the plain version and of shares of the floor.
 REQUIRED = {
     "SAC update": (2.2, 0.6),
@@ -30,60 +26,43 @@ REQUIRED = {
 }
 ROUNDS = {"quick": 3, "full": 5}
 
-Row = dict[str, Any]
 
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Time all cases with each number of threads, one after the other, and write and print the table.
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of :func:`run_benchmark`."""
-    parser.add_argument("--out", metavar="DIR", required=True, help="folder for speed.json, speed.md")
+    :param arguments: without the study's name; default: those of the process
+    :return: exit code, 0: a missed number is a result
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks speed", description=__doc__)
+    parser.add_argument("--out", metavar="PATH", type=Path, default=Path("runs/speed"), help="without a suffix")
     parser.add_argument("--scale", choices=tuple(ROUNDS), default="quick", help="rounds and sizes (default: quick)")
     parser.add_argument("--threads", metavar="N", type=int, nargs="+", default=[1, 2], help="torch threads (1 2)")
     parser.add_argument("--device", default="cpu", help="where networks are computed (default: cpu)")
+    asked = parser.parse_args(arguments)
+    out, scale, device = asked.out, asked.scale, asked.device
+    before, found = th.get_num_threads(), list[Row]()
+    command = f"python -m benchmarks speed --scale {scale} --threads {' '.join(map(str, asked.threads))}"
+    gpu = th.cuda.get_device_name() if device.startswith("cuda") else "unmeasured"
+    made = manifest(f"{command} --device {device}", gpu=gpu, onednn_products_chosen=pays())
 
+    def keep(row: Row) -> None:
+        found.append(row)
+        write_table(out.with_name(f"{out.name}.csv"), found)
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command.
-
-    :param arguments: without the program's name; default: those of the process
-    :return: exit code
-    """
-    parser = argparse.ArgumentParser(prog=NAME, description=__doc__)
-    add_arguments(parser)
-    parsed = parser.parse_args(arguments)
-    return run_benchmark(parsed.out, parsed.scale, parsed.threads, parsed.device)
-
-
-def run_benchmark(out: str, scale: str, threads: Sequence[int], device: str) -> int:
-    """Time all cases with each number of threads, write the figures and print the table.
-
-    :param out: folder
-    :param scale: ``"quick"`` or ``"full"``
-    :param threads: numbers of torch threads
-    :param device: of the networks
-    :return: exit code, 0: a missed number is a result
-    """
-    Path(out).mkdir(parents=True, exist_ok=True)
-    before = th.get_num_threads()
-    found: dict[str, Any] = {"manifest": manifest(scale, threads, device), "cases": [], "growth": []}
-
-    def keep(part: str, row: Row) -> None:
-        found[part].append(row)
-        write_json(Path(out) / "speed.json", found)
-        write_text(Path(out) / "speed.md", table(found["cases"], found["growth"]))
-
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(out.with_name(f"{out.name}.json"), made)
     try:
-        for count in threads:
+        for count in asked.threads:
             th.set_num_threads(count)
             for case in _cases(scale, device):
-                row = {"threads": count, **measure(case, ROUNDS[scale], device)}
-                print(line(row), file=sys.stderr, flush=True)
-                keep("cases", row)
-        th.set_num_threads(min(threads))
+                keep({"threads": count, **measure(case, ROUNDS[scale], device)})
+                print(line(found[-1]), file=sys.stderr, flush=True)
+        th.set_num_threads(min(asked.threads))
         for row in growth(scale, device):
-            keep("growth", row)
+            keep(row)
     finally:
         th.set_num_threads(before)
-    print(table(found["cases"], found["growth"]))
+    print(table(found))
     return 0
 
 
@@ -137,27 +116,16 @@ def growth(scale: str, device: str) -> Iterator[Row]:
         yield {"what": "peak memory, rows in the buffer", "value": size, "megabytes": megabytes}
 
 
-def manifest(scale: str, threads: Sequence[int], device: str) -> Row:
-    """What made the figures."""
-    return {
-        "command": f"{NAME} --scale {scale} --threads {' '.join(map(str, threads))} --device {device}",
-        "versions": provenance.versions(),
-        **provenance.machine(),
-        "commit": provenance.commit(),
-        "gpu": th.cuda.get_device_name() if device.startswith("cuda") else "unmeasured",
-        "oneDNN products chosen": pays(),
-    }
-
-
 def line(row: Row) -> str:
     """One case in words."""
-    share = f", {row['floor_share']:.0%} of the floor" if "floor_share" in row else ""
+    share = f", {row['floor_share']:.0%} of the floor" if row.get("floor_share") is not None else ""
     low, high = row["range"]
     return f"{row['case']}: {row['ratio']:.2f} [{low:.2f}, {high:.2f}] x {row['against']}{share}"
 
 
-def table(rows: Sequence[Row], grown: Sequence[Row]) -> str:
-    """The figures in Markdown."""
+def table(found: Sequence[Row]) -> str:
+    """The figures in Markdown, of rows as :func:`main` writes them."""
+    rows, grown = ([row for row in found if bool(row.get("what")) == of_growth] for of_growth in (False, True))
     text = ["| threads | case | plain | ours | ratio [range] | share of the floor | required | met |", "|" + "---|" * 8]
     for row in rows:
         ms, (low, high) = row["milliseconds"], row["range"]
@@ -166,7 +134,7 @@ def table(rows: Sequence[Row], grown: Sequence[Row]) -> str:
         if ratio is not None:
             enough = row["ratio"] >= ratio and (least is None or row["floor_share"] >= least)
             met = "yes" if enough else "no"
-        share = f"{row['floor_share']:.0%}" if "floor_share" in row else "–"
+        share = f"{row['floor_share']:.0%}" if row.get("floor_share") is not None else "–"
         required = "–" if ratio is None else f"{ratio:g}" + (f", {least:.0%}" if least else "")
         text.append(
             f"| {row['threads']} | {row['case']} | {row['against']}: {ms[row['against']]:.3g} {row['unit']} | "
@@ -174,7 +142,7 @@ def table(rows: Sequence[Row], grown: Sequence[Row]) -> str:
         )
     text += ["", "| growth with | value | plain | ours | ratio |", "|---|---|---|---|---|"]
     for row in grown:
-        if "megabytes" in row:
+        if row.get("megabytes"):
             plain, ours = (row["megabytes"][whose] for whose in MAKERS)
             text.append(f"| {row['what']} | {row['value']:,} | {plain:,} MB | {ours:,} MB | – |")
         else:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from benchmarks.runner import Row, Study
 from benchmarks.theory.bounds import (
     Bound,
     Setting,
@@ -65,21 +68,59 @@ STATEMENTS: dict[str, Callable[[Setting], Bound]] = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print on how many random settings each statement holds and fails, and how near it comes to its bound."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks theory", description=main.__doc__)
+@dataclass(frozen=True)
+class Job:
+    """A statement, on random settings."""
+
+    name: str
+    settings: int
+    seed: int
+    search: int
+
+
+def check(job: Job, folder: Path) -> list[Row]:
+    """On how many random settings a statement holds and fails, and how near it comes to its bound.
+
+    :param job: which statement; with ``search`` steps, also climb to its worst case
+    :param folder: not needed
+    """
+    statement = STATEMENTS[job.name]
+    drawn = (random_setting(np.random.default_rng([job.seed, index]), index) for index in range(job.settings))
+    bounds = [statement(setting) for setting in drawn]
+    holds, ratios = sum(bound.holds for bound in bounds), [b.ratio for b in bounds if not np.isnan(b.ratio)]
+    row: Row = {"holds": holds, "fails": len(bounds) - holds, "largest": max(ratios, default=None)}
+    if job.search:
+        bound, _ = worst_case(statement, job.seed, job.search)
+        row |= {"searched": bound.ratio, "searched_holds": bound.holds}
+    return [row]
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """A line for each statement."""
+    searched = any(row["search"] for row in rows)
+    lines = [f"{'lhs <= rhs':<40}{'holds':>7}{'fails':>7}{'largest lhs/rhs':>17}" + "    by search" * searched]
+    for row in rows:
+        # A ratio is nothing where both sides are zero.
+        largest, found = (np.nan if row.get(name) is None else row[name] for name in ("largest", "searched"))
+        line = f"{row['name']:<40}{row['holds']:>7}{row['fails']:>7}{largest:>17.3f}"
+        line += f"{found:>13.3f}" if searched else ""
+        lines.append(line + "  fails" * (searched and not row["searched_holds"]))
+    return "\n".join(lines)
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--n", type=int, default=500, help="random settings (default 500)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--search", type=int, default=0, metavar="STEPS", help="also climb so many steps a statement")
-    options = parser.parse_args(arguments)
-    settings = [random_setting(np.random.default_rng([options.seed, index]), index) for index in range(options.n)]
-    print(f"{'lhs <= rhs':<40}{'holds':>7}{'fails':>7}{'largest lhs/rhs':>17}" + "    by search" * bool(options.search))
-    for name, statement in STATEMENTS.items():
-        bounds = [statement(setting) for setting in settings]
-        holds = sum(bound.holds for bound in bounds)
-        ratios = [bound.ratio for bound in bounds if not np.isnan(bound.ratio)]
-        line = f"{name:<40}{holds:>7}{len(bounds) - holds:>7}{max(ratios, default=float('nan')):>17.3f}"
-        if options.search:
-            bound, _ = worst_case(statement, options.seed, options.search)
-            line += f"{bound.ratio:>13.3f}" + ("" if bound.holds else "  fails")
-        print(line)
+
+
+main = Study(
+    "theory",
+    "theory",
+    __doc__,
+    jobs=lambda asked: [Job(name, asked.n, asked.seed, asked.search) for name in STATEMENTS],
+    run=check,
+    summary=summary,
+    options=_options,
+    keeps=False,
+).main

@@ -86,6 +86,11 @@ class Case:
     velocity: bool = True
     zeros: float = 0.0
 
+    @property
+    def name(self) -> str:
+        """Of its result."""
+        return self.id
+
     def to_json(self) -> dict[str, Any]:
         """All fields in types of JSON, those that came later only where they are set: older results stay."""
         found: dict[str, Any] = json.loads(json.dumps(asdict(self)))

@@ -1,25 +1,35 @@
-"""Robots of gymnasium, acting at random: is what is put into each found, and nothing where nothing is?"""
+"""Nine robots of gymnasium, seven effects, none, and gusts: what do 300 transitions of random actions say?
+
+    python -m benchmarks tracing robots
+    python -m benchmarks tracing robots --robots Ant-v5 Reacher-v5 --kinds nothing coulomb_friction
+
+Lengths, masses or dampings are declared and off by up to a fifth; of the effect, at a joint or actuator that is drawn,
+nobody is told, and gusts on a joint are no effect of the library. No robot has a policy: it acts at random.
+"""
 
 from __future__ import annotations
 
-import json
+import argparse
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 
 from benchmarks.closed_loop.study import moved, peak_force
-from benchmarks.tracing.first_trace import GUSTS, Gusts, judged
+from benchmarks.runner import Row, Study
+from benchmarks.tracing.targets import GUSTS, Gusts, judged
 from sb3_rpto.algorithms.closed_loop.controller import horizon_of
 from sb3_rpto.effects import LIBRARY, Effect
 from sb3_rpto.effects.names import object_names
 from sb3_rpto.envs.corrected import apply_effects
-from sb3_rpto.files import write_json
 from sb3_rpto.sysid import Measurements, trace
 
 #: What is declared of each; all of it is off by up to a fifth.
@@ -100,26 +110,42 @@ def make_target(job: Job) -> tuple[gym.Env, list[Effect]]:
     return target, effects
 
 
-def run(job: Job, folder: Path) -> dict[str, Any]:
-    """Act at random in the target, trace, and compare with the truth; finished ones are read again.
+def run(job: Job, folder: Path) -> list[Row]:
+    """Act at random in the target, trace, and compare with the truth.
 
     :param job: which
-    :param folder: for result files
-    :return: as :func:`~benchmarks.tracing.first_trace.judged`, what was put in, and seconds
+    :param folder: not needed
+    :return: as :func:`~benchmarks.tracing.targets.judged`, what was put in, and seconds
     """
-    path = folder / f"{job.robot}_{job.kind}_{job.seed}.json"
-    if not path.exists():
-        (target, effects), source = make_target(job), gym.make(job.robot)
-        settings: dict[str, Any] = {"buffer_size": TRANSITIONS, "learning_starts": TRANSITIONS, "seed": job.seed}
-        sac = SAC("MlpPolicy", Monitor(target), device="cpu", **settings)
-        sac.learn(TRANSITIONS)  # collects, without an update
-        assert sac.replay_buffer is not None
-        data = Measurements.from_replay(sac.replay_buffer, source)
-        horizon = horizon_of(data, source)
-        began = time.perf_counter()
-        report = trace(source, data, ROBOTS[job.robot], seed=job.seed, horizon=horizon, threads=1)
-        what = effects[-1].label if job.kind in KINDS else ""
-        row = {**asdict(job), "what": what, **judged(effects, report), "seconds": time.perf_counter() - began}
-        write_json(path, row)
-    found: dict[str, Any] = json.loads(path.read_text())
-    return found
+    (target, effects), source = make_target(job), gym.make(job.robot)
+    settings: dict[str, Any] = {"buffer_size": TRANSITIONS, "learning_starts": TRANSITIONS, "seed": job.seed}
+    sac = SAC("MlpPolicy", Monitor(target), device="cpu", **settings)
+    sac.learn(TRANSITIONS)  # collects, without an update
+    assert sac.replay_buffer is not None
+    data = Measurements.from_replay(sac.replay_buffer, source)
+    horizon = horizon_of(data, source)
+    began = time.perf_counter()
+    report = trace(source, data, ROBOTS[job.robot], seed=job.seed, horizon=horizon, threads=1)
+    what = effects[-1].label if job.kind in KINDS else ""
+    return [{"what": what, **judged(effects, report), "seconds": round(time.perf_counter() - began, 1)}]
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=list(ROBOTS))
+    parser.add_argument("--kinds", nargs="+", default=list(CAUSES), choices=CAUSES)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+
+
+def _jobs(asked: argparse.Namespace) -> list[Job]:
+    """Kind by kind, so that an unfinished table is a fair sample."""
+    listed = [Job(robot, kind, seed) for seed, kind, robot in product(asked.seeds, asked.kinds, asked.robots)]
+    return [job for job in listed if fits(job)]
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """What was found in each robot."""
+    shown = ["robot", "what", "verdict", "named_effects", "true_effects_off", "R_before", "R_after", "seconds"]
+    return pd.DataFrame(rows)[shown].to_string(index=False)
+
+
+main = Study("tracing robots", "trace_robots", __doc__, _jobs, run, summary, _options).main

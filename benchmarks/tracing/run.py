@@ -1,124 +1,92 @@
-"""Generate and trace sets on several cores, one result file each; what is done stays done."""
+"""How often the tracer is right: generated sets whose truth is known are traced and scored.
+
+python -m benchmarks tracing --scale quick                  # 22 sets; --list prints them
+python -m benchmarks tracing --scale full --only '^pair-' --out benchmarks/results/tracing
+python -m benchmarks tracing report benchmarks/results/tracing.csv
+"""
 
 from __future__ import annotations
 
-import json
 import os
 import random
-import re
-import sys
 import time
-import traceback
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.tracing.design import Case, design
+from benchmarks.runner import Result as Kept
+from benchmarks.runner import chosen, kept, parser_of, run_jobs, said
+from benchmarks.tracing.design import SCALES, Case, design
+from benchmarks.tracing.score import Result
+from benchmarks.tracing.table import write
 from benchmarks.tracing.truth import Set, make
-from sb3_rpto.cores import cores
 from sb3_rpto.effects import Effect
-from sb3_rpto.evaluation import provenance
-from sb3_rpto.files import write_json
 from sb3_rpto.sysid import Measurements, Report, trace
 from sb3_rpto.sysid.problem.inverse_dynamics import force_residuals, typical
 from sb3_rpto.sysid.shooting.multiple_shooting import Problem
 from sb3_rpto.sysid.shooting.prediction_errors import HorizonError, horizon_errors
 from sb3_rpto.sysid.shooting.windows import cut
-from sb3_rpto.version import __version__
 
 HORIZON = 0.5
 """Predictions of this length in s are compared, on test runs."""
 WINDOWS = 96
 """Most windows that the true structure is fitted to."""
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-Result = dict[str, Any]
 
 
-def selected(scale: str, only: str | None = None) -> list[Case]:
-    """The cases of a scale whose id matches a regular expression anywhere.
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Trace what has no result yet, then write and print the table of all that has one, of earlier calls too.
 
-    :raises ValueError: another scale, no regular expression, or nothing matches
+    :param arguments: without the study's name; default: those of the process
+    :return: exit code, 1 where traces raised an error
     """
-    try:
-        cases = [case for case in design(scale) if re.search(only or "", case.id)]
-    except re.error as error:
-        raise ValueError(f"only is {only!r}, which is no regular expression: {error}") from error
-    if not cases:
-        raise ValueError(f"no case of the {scale} design matches {only!r}; ids look like {design(scale)[0].id!r}")
-    return cases
+    parser = parser_of("tracing", __doc__, "tracing")
+    parser.add_argument("--scale", choices=SCALES, default="quick", help="22 or 215 sets (default: quick)")
+    asked = parser.parse_args(arguments)
+    listed = chosen(design(asked.scale), asked.only)
+    if asked.list:
+        print(*(case.id for case in listed), sep="\n")
+        return 0
+    results = run(asked.runs, listed, asked.workers, asked.backend, asked.fresh)
+    of_now = {result["name"]: result for result in results}
+    found = [of_now.get(case.id) or kept(case, asked.runs / "runs") for case in design(asked.scale)]
+    cases = [case for case, one in zip(design(asked.scale), found) if one]
+    command = f"python -m benchmarks tracing --scale {asked.scale}" + f" --only '{asked.only}'" * bool(asked.only)
+    out = asked.out or asked.runs / "table"
+    print(write(out, [flat(result) for result in found if result], cases, command))
+    return said(results, out)
 
 
 def run(
-    out: str | os.PathLike[str],
-    scale: str = "quick",
+    folder: str | os.PathLike[str],
+    cases: Sequence[Case],
     workers: int | None = None,
-    only: str | None = None,
-    resume: bool = True,
-) -> list[Result]:
-    """Trace the cases that have no result yet, each in one thread, and return all results.
+    backend: str = "joblib",
+    fresh: bool = False,
+) -> list[Kept]:
+    """Trace the cases that have no result yet, and return the results of all in their order.
 
-    A result is kept while its case stays as it is, also where the tracer raised an error; a torn file, or one of
-    another case, is made again.
-
-    :param out: folder; results are written to ``cases/ID.json`` in it
-    :param scale: as :func:`~benchmarks.tracing.design.design` takes it
-    :param workers: processes; default: one a core
-    :param only: regular expression that a case's id must match somewhere
-    :param resume: False: trace all again
-    :return: the results of the cases, in their order
-    :raises ValueError: nothing matches, or a setting out of range
+    :param folder: of the study; other parameters are as :func:`~benchmarks.runner.run_jobs` takes them
+    :param cases: of a design
     """
-    if workers is not None and workers < 1:
-        raise ValueError(f"workers is {workers}; give 1 or more, or nothing for one a core")
-    cases = selected(scale, only)
-    folder = Path(out) / "cases"
-    folder.mkdir(parents=True, exist_ok=True)
-    pending = [case for case in cases if not resume or stored(folder, case) is None]
     # In mixed order an unfinished run is a fair sample, and its time left an honest guess.
-    random.Random(0).shuffle(pending)
-    made_by, count = provenance.commit(), min(workers or cores(), max(1, len(pending)))
-    say = _Progress(len(pending))
-    if count == 1:
-        for case in pending:
-            say(work(case, folder, made_by))
-    else:
-        with _environment(dict.fromkeys(_ONE_THREAD, "1")):
-            pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"))
-            try:
-                for done in as_completed([pool.submit(work, case, folder, made_by) for case in pending]):
-                    say(done.result())
-            finally:
-                pool.shutdown(cancel_futures=True)
-    return [result for case in cases if (result := stored(folder, case)) is not None]
+    mixed = random.Random(0).sample(cases, len(cases))
+    results = run_jobs(examined, mixed, Path(folder) / "runs", workers, backend, fresh=fresh)
+    of = {result["name"]: result for result in results}
+    return [of[case.id] for case in cases]
 
 
-def stored(folder: Path, case: Case) -> Result | None:
-    """The result of a case; None where there is none, it is torn, or it belongs to another case of the same id."""
-    try:
-        result = json.loads((folder / f"{case.id}.json").read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
-        return None
-    return result if isinstance(result, dict) and result.get("case") == case.to_json() else None
+def examined(case: Case) -> list[dict[str, Any]]:
+    """The job of a case."""
+    return [examine(case)]
 
 
-def work(case: Case, folder: Path, commit: str | None) -> Result:
-    """Trace a case and write its result, whatever comes of it."""
-    result: Result = {"case": case.to_json(), "version": __version__, "commit": commit, "error": None}
-    start = time.process_time()
-    try:
-        result |= examine(case)
-    except Exception:
-        result["error"] = traceback.format_exc(limit=-3)
-        result["seconds"] = time.process_time() - start
-    write_json(folder / f"{case.id}.json", result)
-    return result
+def flat(result: Kept) -> Result:
+    """What is scored of a kept result."""
+    (row,) = result["rows"] or [{}]
+    return {"case": result["job"], **{name: result[name] for name in ("commit", "error", "seconds")}, **row}
 
 
 def examine(case: Case, episodes: int | None = None, duration: float | None = None) -> Result:
@@ -186,36 +154,3 @@ def _at_horizon(errors: Sequence[HorizonError]) -> dict[str, float] | None:
         if e.horizon == HORIZON:
             return dict(zip(e.joints, map(float, e.rmse)))
     return None
-
-
-@contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Environment variables for the processes that start meanwhile."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-class _Progress:
-    """A line for each case that is done, with the time left."""
-
-    def __init__(self, count: int) -> None:
-        self.count, self.done, self.start = count, 0, time.perf_counter()
-
-    def __call__(self, result: Result) -> None:
-        self.done += 1
-        left = (time.perf_counter() - self.start) / self.done * (self.count - self.done)
-        outcome = "error" if result["error"] else result["verdict"]
-        print(
-            f"[{self.done}/{self.count}, {left / 60:.0f} min left] {result['case']['id']}: {outcome}, "
-            f"{result['seconds']:.0f} s",
-            file=sys.stderr,
-            flush=True,
-        )

@@ -133,7 +133,7 @@ def score(results: Iterable[Result]) -> list[Row]:
 def judge(result: Result) -> Row:
     """Score a result; where the tracer raised an error, all measures that could hold fail.
 
-    :param result: as :func:`~benchmarks.tracing.run.work` stores it
+    :param result: as :func:`~benchmarks.tracing.run.flat` makes it
     """
     case = result["case"]
     measures = APPLY[case["group"]]

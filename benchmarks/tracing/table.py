@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-import io
+import argparse
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from benchmarks.runner import manifest, read_table, write_table
 from benchmarks.tracing.design import GROUPS, HIGH, LOW, Case, fingerprint
 from benchmarks.tracing.planting import SYSTEMS
-from benchmarks.tracing.score import APPLY, MEASURES, Result, Row, Share, score, share
+from benchmarks.tracing.score import APPLY, MEASURES, Result, Row, score, share
 from benchmarks.tracing.truth import TWINS
-from sb3_rpto.evaluation import provenance
-from sb3_rpto.files import json_text, write_text
+from sb3_rpto.files import write_json, write_text
 
 MINUTES = 3.0
 """A set of a machine with one or two joints is to be traced within this time."""
@@ -28,19 +26,12 @@ REQUIRED: tuple[tuple[str, str, str, float | None, float], ...] = (
     ("outside the library: never called explained", "outside", "not explained", None, 1.0),
 )
 """What must hold: words, group, measure, noise (None: any), least share."""
-_BY: dict[str, Callable[[Row], str]] = {
-    "all": lambda row: "",
-    "noise": lambda row: f"{1e3 * row.case['noise']:g} mrad",
-    "kind": lambda row: "+".join(kind for kind, _ in row.case["effects"]),
-    "system": lambda row: row.case["system"],
-    "size": lambda row: "+".join(dict.fromkeys(size for _, size in row.case["effects"])),
-}
 
 
 def table(results: Sequence[Result], planned: int | None = None) -> str:
     """The benchmark's results in Markdown.
 
-    :param results: of :func:`~benchmarks.tracing.run.run`
+    :param results: as :func:`~benchmarks.tracing.run.flat` makes them
     :param planned: cases of the design; default: as many as there are results
     """
     rows = score(results)
@@ -89,11 +80,15 @@ def _groups(rows: Sequence[Row]) -> list[str]:
     return parts
 
 
+def _kind(row: Row) -> str:
+    return "+".join(kind for kind, _ in row.case["effects"])
+
+
 def _kinds(rows: Sequence[Row]) -> str:
     single = [r for r in rows if r.case["group"] == "single"]
     lines = []
-    for kind in dict.fromkeys(_BY["kind"](r) for r in single):
-        part = [r for r in single if _BY["kind"](r) == kind]
+    for kind in dict.fromkeys(map(_kind, single)):
+        part = [r for r in single if _kind(r) == kind]
         cells = [share([r for r in part if r.case["noise"] == n], "right class") for n in (LOW, HIGH)]
         others = [share(part, m) for m in ("itself", "values", "error reduction", "says explained")]
         lines.append([kind, *(f"{s.hits}/{s.n}" for s in (*cells, *others))])
@@ -129,89 +124,41 @@ def _explained() -> str:
     return "\n".join([*measures, "", heading, "", *same])
 
 
-def cases_csv(rows: Sequence[Row]) -> str:
-    """One line a case."""
-    measures = list(MEASURES)
-    header = [
-        "id",
-        "group",
-        "system",
-        "effects",
-        "sizes",
-        "noise",
-        "jitter",
-        "quantum",
-        "velocity",
-        "planted_by",
-        "seed",
-    ]
-    header += ["verdict", "planted", "named", "class_sizes", "deviation", "reduction", "ratio_before", "ratio_after"]
-    header += ["seconds", "passed", *(m.replace(" ", "_") for m in measures), "why"]
-    lines = []
-    for r in rows:
-        c = r.case
-        kinds, sizes = ("+".join(part) for part in zip(*c["effects"])) if c["effects"] else ("", "")
-        lines.append(
-            [c["id"], c["group"], c["system"], kinds, sizes]
-            + [c[name] for name in ("noise", "jitter", "quantum", "velocity", "planted_by", "seed")]
-            + [r.verdict, "+".join(r.planted), "+".join(r.named), "+".join(map(str, r.classes))]
-            + [_number(v, 4) for v in (r.deviation, r.reduction, r.ratio_before, r.ratio_after)]
-            + [f"{r.seconds:.1f}", int(r.passed)]
-            + ["" if r.measures.get(m) is None else int(bool(r.measures[m])) for m in measures]
-            + [r.why]
-        )
-    return _csv([header, *lines])
+def write(
+    out: str | os.PathLike[str], results: Sequence[Result], cases: Sequence[Case] = (), command: str | None = None
+) -> str:
+    """Write the table ``OUT.csv``, its manifest ``OUT.json`` and the report ``OUT.md``; return the report.
 
-
-def summary_csv(rows: Sequence[Row]) -> str:
-    """Every share: group, what it is split by, value, measure, hits, n, share, low, high."""
-    lines: list[list[Any]] = [["group", "by", "value", "measure", "hits", "n", "share", "low", "high"]]
-    for group in GROUPS:
-        part = [r for r in rows if r.case["group"] == group]
-        for by, key in _BY.items():
-            for value in dict.fromkeys(map(key, part)):
-                for measure in APPLY[group]:
-                    s: Share = share([r for r in part if key(r) == value], measure)
-                    if s.n:
-                        shares = [f"{x:.4f}" for x in (s.value, s.low, s.high)]
-                        lines.append([group, by, value, measure, s.hits, s.n, *shares])
-    return _csv(lines)
-
-
-def manifest(results: Sequence[Result], cases: Sequence[Case], command: str) -> dict[str, Any]:
-    """What made the table: command, versions, commits, the design's hash, seconds."""
-    return {
-        "command": command,
-        "design": fingerprint(cases),
-        "cases": len(cases),
-        "done": len(results),
-        "errors": sum(result["error"] is not None for result in results),
-        "commits": sorted({str(result["commit"]) for result in results}),
-        "traced_with": sorted({result["version"] for result in results}),
-        **provenance.machine(),
-        "versions": provenance.versions(),
-        "seconds": round(sum(result["seconds"] for result in results), 1),
-    }
-
-
-def write(out: str | os.PathLike[str], results: Sequence[Result], cases: Sequence[Case], command: str) -> str:
-    """Write ``table.md``, ``summary.csv``, ``cases.csv`` and ``manifest.json`` to a folder; return the table."""
-    rows, text = score(results), table(results, len(cases))
-    files = {
-        "table.md": text,
-        "summary.csv": summary_csv(rows),
-        "cases.csv": cases_csv(rows),
-        "manifest.json": json_text(manifest(results, cases, command)) + "\n",
-    }
-    for name, content in files.items():
-        write_text(Path(out) / name, content)
+    :param out: without a suffix
+    :param results: to score
+    :param cases: of the design
+    :param command: that made them; None: table and manifest are there
+    """
+    path, text = Path(out), table(results, len(cases) or None)
+    if command is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        errors = sum(result["error"] is not None for result in results)
+        seconds = round(sum(result["seconds"] for result in results), 1)
+        counts = {"cases": len(cases), "done": len(results), "errors": errors, "seconds": seconds}
+        made = manifest(command, results, design=fingerprint(cases), **counts)
+        write_json(path.with_name(f"{path.name}.json"), made)
+        rows = [{"id": result["case"]["id"], **result} for result in results]
+        write_table(path.with_name(f"{path.name}.csv"), rows, digits=None)
+    write_text(path.with_name(f"{path.name}.md"), text)
     return text
 
 
-def _csv(lines: Sequence[Sequence[Any]]) -> str:
-    stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerows(lines)
-    return stream.getvalue()
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Score a table of results anew, as ``python -m benchmarks tracing`` writes it.
+
+    :param arguments: default: those of the process
+    :return: exit code
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks tracing report", description=main.__doc__)
+    parser.add_argument("table", metavar="TABLE", type=Path, help="CSV file; the report goes beside it")
+    path = parser.parse_args(arguments).table
+    print(write(path.with_suffix(""), read_table(path)))
+    return 0
 
 
 def _number(value: float | None, digits: int = 3) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -104,7 +103,7 @@ def variant_of(job: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in job.items() if name not in ("target", "seed")}
 
 
-def jobs(suite: Suite, seeds: int | None = None, only: str | None = None) -> list[Job]:
+def jobs(suite: Suite, seeds: int | None = None) -> list[Job]:
     """All runs, in an order in which an unfinished suite is a fair sample.
 
     A block is one seed of all variants on one target. Blocks follow one another seed by seed, within a seed target by
@@ -113,8 +112,7 @@ def jobs(suite: Suite, seeds: int | None = None, only: str | None = None) -> lis
 
     :param suite: which
     :param seeds: how many of each variant; None: the suite's numbers
-    :param only: regular expression that a run's name must match somewhere
-    :raises ValueError: less than one seed, no regular expression, or nothing matches
+    :raises ValueError: less than one seed
     """
     if seeds is not None and seeds < 1:
         raise ValueError(f"seeds is {seeds}; give 1 or more, or nothing for the suite's numbers")
@@ -125,13 +123,7 @@ def jobs(suite: Suite, seeds: int | None = None, only: str | None = None) -> lis
             for place in _mixed([p for p in suite.places if turn < len(p.targets)], rng):
                 due = [variant for variant in place.variants if seed < (seeds or variant.seeds)]
                 listed += [_job(suite, place, place.targets[turn], variant, seed) for variant in _mixed(due, rng)]
-    try:
-        chosen = [job for job in listed if re.search(only or "", job.name)]
-    except re.error as error:
-        raise ValueError(f"only is {only!r}, which is no regular expression: {error}") from error
-    if not chosen:
-        raise ValueError(f"no run of {suite.name} matches {only!r}; names look like {listed[0].name!r}")
-    return chosen
+    return listed
 
 
 def _mixed(items: Sequence[Any], rng: random.Random) -> list[Any]:

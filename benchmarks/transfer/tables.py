@@ -1,4 +1,8 @@
-"""The tables and the figure of a suite, written beside its manifest: ``python -m benchmarks transfer report``."""
+"""The report and the figure of a suite, of a folder of runs or of a committed table.
+
+python -m benchmarks transfer report runs/transfer_quick
+python -m benchmarks transfer report benchmarks/results/transfer_quick.csv
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,10 @@ from typing import Any
 
 import pandas as pd
 
+from benchmarks.runner import Result, last_line, read_table, write_table
 from benchmarks.transfer import plots
 from benchmarks.transfer.plan import variant_of
-from sb3_rpto.evaluation.statistics import (
+from benchmarks.transfer.statistics import (
     PLACE,
     SHARE,
     costs,
@@ -39,19 +44,19 @@ SMALL_GAP = 0.05
 class Study:
     """What is known of a suite.
 
-    :param manifest: of the folder
+    :param manifest: of the suite
+    :param results: of all runs
     :param rows: one line a run and evaluation: task, target, label, method, seed, steps, return, score, updates,
         source_steps, seconds, factors; model_error where a model was learned
     :param failed: name and last line of the error of each run that failed
     :param left_out: name of each run that is not of the suite as it is now, and why
-    :param commits: of the runs
     """
 
     manifest: dict[str, Any]
+    results: list[Result]
     rows: pd.DataFrame
     failed: dict[str, str]
     left_out: dict[str, str]
-    commits: list[str]
 
     @property
     def labels(self) -> list[str]:
@@ -71,53 +76,63 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: without the program's name; default: those of the process
     :return: exit code
     """
-    parser = argparse.ArgumentParser(prog=NAME, description=__doc__)
-    parser.add_argument("folder", metavar="DIR", help="folder of a suite, as 'python -m benchmarks transfer' fills it")
-    print(write(parser.parse_args(arguments).folder))
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(prog=NAME, description=__doc__, formatter_class=form)
+    parser.add_argument("where", metavar="DIR", help="of --runs of a suite, finished or not, or its table (.csv)")
+    parser.add_argument("--out", metavar="PATH", help="without a suffix (default: table in DIR, or beside the table)")
+    asked = parser.parse_args(arguments)
+    print(write(asked.where, asked.out))
     return 0
 
 
-def load(folder: str | os.PathLike[str]) -> Study:
+def load(where: str | os.PathLike[str]) -> Study:
     """Read a suite's results; unfinished ones will do.
 
+    :param where: folder of runs, or table of results with its manifest beside it
     :raises FileNotFoundError: no manifest
     :raises ValueError: no run is done, or a torn manifest
     """
-    path = Path(folder) / "manifest.json"
+    table = Path(where) if Path(where).suffix == ".csv" else None
+    path = table.with_suffix(".json") if table else Path(where) / "manifest.json"
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{folder} has no manifest.json; run 'python -m benchmarks transfer --out {folder}' first"
-        )
+        raise FileNotFoundError(f"{path} is not there; run 'python -m benchmarks transfer --runs {where}' first")
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(
-            f"{path} is torn ({error}); run 'python -m benchmarks transfer' again with that --out"
+            f"{path} is torn ({error}); run 'python -m benchmarks transfer' again with that --runs"
         ) from error
     rows: list[dict[str, Any]] = []
-    failed, left_out, commits = dict[str, str](), dict[str, str](), set[str]()
-    variants = manifest.get("variants")  # folders of earlier versions do not tell
-    for file in sorted((Path(folder) / "runs").glob("*.json")):
-        try:
-            result = json.loads(file.read_text(encoding="utf-8"))
-            job = result["job"]
-        except (ValueError, TypeError, KeyError):  # torn: the next sweep makes it again
-            failed[file.stem] = "torn file"
-            continue
+    failed, left_out = dict[str, str](), dict[str, str]()
+    results = read_table(table) if table else _results(Path(where) / "runs", failed)
+    for result in results:
+        job = result["job"]
         reference = manifest["references"].get(f"{job['task']}_{job['target']}", {})
-        if result["error"]:
-            failed[result["name"]] = result["error"].strip().splitlines()[-1]
+        if result.get("error"):
+            failed[result["name"]] = last_line(result["error"])
         elif result["source"]["sha256"] != reference.get("agent"):
             left_out[result["name"]] = "of another source agent"
-        elif variants is not None and variant_of(job) not in variants:
+        elif "variants" in manifest and variant_of(job) not in manifest["variants"]:  # earlier ones do not tell
             left_out[result["name"]] = "of other settings than the suite's"
         else:
-            commits.add(str(result["commit"]))
             known = {name: job[name] for name in ("task", "target", "label", "method", "seed", "factors")}
             rows += [{**known, **row} for row in _whole(job, result["rows"])]
     if not rows:
-        raise ValueError(f"{folder}: no run is done; go on with 'python -m benchmarks transfer --out {folder}'")
-    return Study(manifest, scored(pd.DataFrame(rows), manifest["references"]), failed, left_out, sorted(commits))
+        raise ValueError(f"{where}: no run is done; go on with 'python -m benchmarks transfer --runs {where}'")
+    scores = scored(pd.DataFrame(rows), manifest["references"])
+    return Study(manifest, results, scores, dict(sorted(failed.items())), left_out)
+
+
+def _results(folder: Path, failed: dict[str, str]) -> list[Result]:
+    """Those of a folder; torn files, which the next sweep makes again, are noted."""
+    results = []
+    for file in sorted(folder.glob("*.json")):
+        try:
+            result = json.loads(file.read_text(encoding="utf-8"))
+            results.append({**result, "job": result["job"]})
+        except (ValueError, TypeError, KeyError):
+            failed[file.stem] = "torn file"
+    return results
 
 
 def _whole(job: Mapping[str, Any], rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -127,12 +142,15 @@ def _whole(job: Mapping[str, Any], rows: Sequence[dict[str, Any]]) -> list[dict[
     return list(rows)
 
 
-def write(folder: str | os.PathLike[str]) -> str:
-    """Write ``report.md``, ``report.json``, the tables as CSV and the figure ``curves.png`` beside the manifest.
+def write(where: str | os.PathLike[str], out: str | os.PathLike[str] | None = None) -> str:
+    """Write the report ``OUT.md`` and the figure ``OUT.png``; of a folder, ``OUT.csv`` and ``OUT.json``, too.
 
+    :param where: as :func:`load` takes it
+    :param out: without a suffix; None: ``table`` in the folder, or beside the table under its name
     :return: the report in Markdown
     """
-    study, out = load(folder), Path(folder)
+    study, path = load(where), Path(where)
+    stem = Path(out) if out else path.with_suffix("") if path.suffix == ".csv" else path / "table"
     references = study.manifest["references"]
     lines = curves(study.rows)
     tables = {
@@ -144,14 +162,14 @@ def write(folder: str | os.PathLike[str]) -> str:
     }
     if study.rows["factors"].map(len).any():
         tables["effects"] = effects(study.rows, study.manifest["interactions"])
-    for name, table in tables.items():
-        write_text(out / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
-    counted = {"runs": _runs(study.rows), "failed": study.failed, "left_out": study.left_out, "commits": study.commits}
-    everything = {"manifest": study.manifest, **counted, **{n: t.to_dict("records") for n, t in tables.items()}}
-    write_json(out / "report.json", everything)
-    plots.learning_curves(lines, references, study.labels, study.ours, out / "curves.png")
-    text = markdown(study, tables)
-    write_text(out / "report.md", text)
+    if path.suffix != ".csv":
+        write_table(stem.with_name(f"{stem.name}.csv"), study.results, digits=None)
+        commits = sorted({str(result["commit"]) for result in study.results})
+        made = {name: study.results[0][name] for name in ("versions", "python", "machine")}
+        write_json(stem.with_name(f"{stem.name}.json"), {**study.manifest, "commits": commits, **made})
+    plots.learning_curves(lines, references, study.labels, study.ours, stem.with_name(f"{stem.name}.png"))
+    text = markdown(study, tables, f"{stem.name}.png")
+    write_text(stem.with_name(f"{stem.name}.md"), text)
     return text
 
 
@@ -162,11 +180,12 @@ def _runs(rows: pd.DataFrame) -> int:
 # --- Markdown -------------------------------------------------------------------------------------------------------
 
 
-def markdown(study: Study, tables: Mapping[str, pd.DataFrame]) -> str:
+def markdown(study: Study, tables: Mapping[str, pd.DataFrame], figure: str) -> str:
     """The report, for readers.
 
     :param study: of :func:`load`
     :param tables: those that :func:`write` makes
+    :param figure: file of the learning curves
     """
     manifest, references = study.manifest, study.manifest["references"]
     done = _runs(study.rows)
@@ -186,7 +205,7 @@ def markdown(study: Study, tables: Mapping[str, pd.DataFrame]) -> str:
         parts += ["## All targets together", _overall(study, tables)]
         for (task, target), part in tables["curves"].groupby(PLACE, sort=False):
             parts += [f"## {task} {target}", _place(study, tables, part, task, target)]
-    parts += ["## How to read this", _explained(), "![learning curves](curves.png)"]
+    parts += ["## How to read this", _explained(), f"![learning curves]({figure})"]
     return "\n\n".join(parts) + "\n"
 
 

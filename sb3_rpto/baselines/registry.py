@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 from stable_baselines3 import SAC
@@ -21,7 +20,6 @@ from sb3_rpto.baselines.mbpo import MBPO
 from sb3_rpto.baselines.pdml import PDML
 from sb3_rpto.baselines.policy_distillation import clone_kwargs
 from sb3_rpto.baselines.ptp import PTP
-from sb3_rpto.baselines.shared_dynamics import fit_once
 from sb3_rpto.baselines.slbo import SLBO
 from sb3_rpto.evaluation.learning_curve import LearningCurve, MakeEnv
 from sb3_rpto.presets import resolve_preset
@@ -34,7 +32,7 @@ class Run:
     :param vec_normalize: file of the statistics by which the source model sees observations; False: it sees raw ones;
         None: algorithms of ours look beside its zip
     :param device: to learn on; runs side by side are quickest on the CPU
-    :param models: folder where fits of networks to the source are kept, for the runs that begin alike
+    :param before_learning: is given an algorithm of ours as it was constructed
     """
 
     source_model: str
@@ -46,7 +44,7 @@ class Run:
     source_data: str | None = None
     kwargs: dict[str, Any] = field(default_factory=dict)
     device: str = "cpu"
-    models: Path | None = None
+    before_learning: Callable[[TransferAlgorithm], None] = lambda model: None
     vec_normalize: str | Literal[False] | None = None
 
     def source(self, n_envs: int = 1) -> VecEnv:
@@ -101,8 +99,7 @@ def two_worlds(cls: type[TransferAlgorithm], run: Run, curve: LearningCurve) -> 
     source, kwargs = make_vec_env(run.make_source, n_envs=run.n_source_envs), dict(run.kwargs)
     kwargs |= {"source_data": run.source_data, "vec_normalize": run.vec_normalize}
     model = cls.from_source(run.source_model, source, run.make_target(), seed=run.seed, device=run.device, **kwargs)
-    if run.models is not None:
-        fit_once(model, run.models)
+    run.before_learning(model)
     model.learn(run.budget, callback=curve)
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from pathlib import Path
 from typing import Any
 
+from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.baselines.registry import REGISTRY, Run
 from sb3_rpto.evaluation.learning_curve import LearningCurve, MakeEnv
 
@@ -25,7 +25,7 @@ def transfer(
     n_source_envs: int = 1,
     source_data: str | None = None,
     read: Callable[[Any], dict[str, Any]] | None = None,
-    models: Path | None = None,
+    before_learning: Callable[[TransferAlgorithm], None] = lambda model: None,
     **kwargs: Any,
 ) -> list[dict[str, Any]]:
     """Run one method once.
@@ -41,7 +41,7 @@ def transfer(
     :param n_source_envs: source environments that step side by side
     :param source_data: transitions of the source, for the methods that use some (phi_0, cloning, mixed batches)
     :param read: further values of a row
-    :param models: folder where fits of networks to the source are kept, for the runs that begin alike
+    :param before_learning: is given an algorithm of ours as it was constructed
     :param kwargs: arguments of the method: of its constructor, or see :mod:`~sb3_rpto.baselines.registry`
     :return: one row an evaluation: method, seed, steps, return, updates, source_steps, seconds
     """
@@ -50,7 +50,9 @@ def transfer(
     chosen = REGISTRY[method]
     curve = LearningCurve(make_target, every, n_episodes, seed, read, after_update=chosen.in_batches)
     worlds = make_source, make_target
-    given = Run(source_model, *worlds, budget, seed, n_source_envs, source_data, kwargs, models=models)
+    given = Run(
+        source_model, *worlds, budget, seed, n_source_envs, source_data, kwargs, before_learning=before_learning
+    )
     chosen.run(given, curve)
     curve.env.close()
     return [{"method": method, "seed": seed, **row} for row in curve.rows]

@@ -130,7 +130,7 @@ def _once(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _result(file: Path) -> list[dict[str, Any]] | None:
-    """The rows of a file of ``sb3-rpto transfer``, ``train`` or ``benchmark transfer``; None for another file."""
+    """The rows of a result of ``sb3-rpto transfer`` or ``train``, or of a benchmark; None for another file."""
     from sb3_rpto.envs.tasks import env_id
 
     try:
@@ -139,7 +139,8 @@ def _result(file: Path) -> list[dict[str, Any]] | None:
             print(f"sb3-rpto: left out, learned from a log, so that there is no curve: {file}", file=sys.stderr)
             return None
         if "job" in content:  # of the benchmark: a method with its settings has a label
-            shifted = env_id(content["job"]["task"], content["target"]["shift"])  # as of ``transfer``
+            shift = content.get("target", content["job"]).get("shift", content["job"].get("target"))
+            shifted = env_id(content["job"]["task"], shift)  # as of ``transfer``
             of_run = {"method": content["job"]["label"], "target": shifted, "seed": content["job"]["seed"]}
             known = {name: content["job"].get(name) for name in ("settings", "episodes")}
             known["source"] = env_id(content["job"]["task"])

@@ -16,7 +16,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common import base_class
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_rpto.baselines import sac_variants, shared_dynamics
+from sb3_rpto.baselines import sac_variants
 from sb3_rpto.baselines.registry import REGISTRY, Run
 from sb3_rpto.baselines.transfer import METHODS, transfer
 from sb3_rpto.buffers import chronological
@@ -163,43 +163,6 @@ def test_given_source_data_cost_no_source_steps(source_model: str, source_data: 
     assert [row["source_steps"] for row in rows] == [0] * 4
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("method", ["rpto", "slbo", "ptp"])
-def test_phi_0_is_fitted_once_and_is_what_a_run_fits_by_itself(
-    method: str, source_model: str, source_data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shared_dynamics, "commit", lambda: "abc")
-
-    def returns(**kwargs: Any) -> list[tuple[float, ...]]:
-        rows = run(method, source_model, source_data=source_data, **kwargs)
-        return [(row["return"], row["updates"], row["source_steps"]) for row in rows]
-
-    alone, first, again = returns(), returns(models=tmp_path), returns(models=tmp_path)
-    assert alone == first == again
-    (kept,) = tmp_path.iterdir()
-    before = kept.stat().st_mtime_ns
-    returns(models=tmp_path)
-    assert kept.stat().st_mtime_ns == before
-    returns(models=tmp_path, seed=4)
-    monkeypatch.setattr(shared_dynamics, "commit", lambda: "abd")
-    returns(models=tmp_path)
-    assert len(list(tmp_path.iterdir())) == 3  # another seed and another commit have fits of their own
-    monkeypatch.setattr(shared_dynamics, "commit", lambda: "abd-dirty")
-    returns(models=tmp_path, seed=5)
-    assert len(list(tmp_path.iterdir())) == 3
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_what_fits_no_networks_to_recorded_steps_keeps_none(
-    source_model: str, source_data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shared_dynamics, "commit", lambda: "abc")
-    run("rpo", source_model, source_data=source_data, models=tmp_path)
-    run("rpto", source_model, models=tmp_path)  # which collects its steps in learn()
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_mixed_sac_draws_half_of_each_world(source_model: str) -> None:
     data, _ = sac_variants.source_transitions(source_model, cartpole(), 0)
     model = sac_variants.mixed_sac(
@@ -340,7 +303,7 @@ def test_a_discount_holds_for_returns_of_several_steps_too(tmp_path: Path) -> No
 
 
 def test_fresh_source_transitions_are_as_many_as_they_cost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sac_variants.warm, "PHI_0_STEPS", 90)
+    monkeypatch.setattr(sac_variants.warm_start, "PHI_0_STEPS", 90)
     SAC("MlpPolicy", cartpole(), policy_kwargs=SMALL_POLICY, buffer_size=30, device="cpu").save(tmp_path / "sac.zip")
     found, spent = sac_variants.source_transitions(tmp_path / "sac.zip", cartpole(), 0)
     assert len(found["rewards"]) == spent == 90

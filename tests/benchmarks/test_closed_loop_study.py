@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -11,7 +12,9 @@ import pandas as pd
 import pytest
 import torch as th
 
+from benchmarks.__main__ import main
 from benchmarks.closed_loop import study as study
+from benchmarks.runner import read_table, run_jobs
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.effects import Declared
 
@@ -105,14 +108,21 @@ def test_how_targets_differ_is_not_how_runs_do() -> None:
     assert line["low"] == line["iqm"] == line["high"]  # all runs of a target begin alike
 
 
-def test_an_oracle_of_other_steps_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = tmp_path / "oracle_hopper_none_0.json"
-    kept.write_text(json.dumps({"return": 7.0, "steps": 10}))
+def test_an_oracle_is_the_best_of_its_evaluations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
     monkeypatch.setattr(study, "source_agent", lambda *_: ("agent.zip", None))
-    monkeypatch.setattr(study, "transfer", lambda *_, **__: [{"return": 1.0}, {"return": 9.0}])
-    assert study.oracle("hopper", "none", 0, tmp_path, steps=10) == 7.0
-    assert study.oracle("hopper", "none", 0, tmp_path, steps=20) == 9.0
-    assert json.loads(kept.read_text()) == {"return": 9.0, "steps": 20}
+    monkeypatch.setattr(
+        study,
+        "transfer",
+        lambda *args, **kwargs: (
+            asked.append((args[0], args[4], kwargs["every"]))
+            or [{"steps": 100_000, "return": value} for value in (1.0, 9.0, 7.0)]
+        ),
+    )
+    job = study.Job("hopper", "none", 0, study.ORACLE, 0, budget=500)
+    run_jobs(partial(study.run, folder=tmp_path), [job], tmp_path / "runs", 1)
+    assert asked == [("sac-warm", 100_000, tuple(range(10_000, 100_001, 10_000)))]
+    assert study.oracles(study.collected(tmp_path / "runs")) == {("hopper", "none", 0): 9.0}
 
 
 def test_a_folder_has_runs_of_one_source_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,7 +166,9 @@ def test_noisy_sensors_are_those_of_the_target_and_the_loop_is_told(
     monkeypatch.setattr(study, "source_agent", lambda *_: ("agent", None))
     monkeypatch.setattr(study, "transfer", lambda *args, **kwargs: told.append((args[3], kwargs)) or [])
     for method in ("SAC-warm", "RPTO-physical, open loop", "RPTO-physical, closed loop"):
-        study.run(study.Job("double-pendulum", "none", 0, method, 0, sensors=1e-3), tmp_path)
+        job = study.Job("double-pendulum", "none", 0, method, 0, sensors=1e-3)
+        assert job.name.endswith("_0_sensors-0.001")
+        study.run(job, tmp_path)
     noise = np.array([1e-3] * 5 + [1e-2] * 3 + [0.0])
     for target, _ in told:
         shown, exact = (env.reset(seed=0)[0] for env in (target(), study.make_target("double-pendulum", "none", 0)))
@@ -165,48 +177,52 @@ def test_noisy_sensors_are_those_of_the_target_and_the_loop_is_told(
     passed = [kwargs.get("dynamics_kwargs") for _, kwargs in told]
     assert passed[:2] == [None, None]
     np.testing.assert_allclose(passed[2]["observation_noise"], noise)
-    names = {path.name for path in tmp_path.iterdir()}
-    assert "double-pendulum_none_0_SAC-warm_0_sensors-0.001.json" in names
 
 
-def test_a_run_says_which_commit_made_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+    """The points of the runs that were made."""
+    made: list[tuple[int, ...]] = []
     monkeypatch.setattr(study, "source_agent", lambda *_: ("agent", None))
-    monkeypatch.setattr(study, "commit", lambda: "0123abc")
-    monkeypatch.setattr(study, "transfer", lambda *_, **__: [{"method": "zero-shot", "return": 1.0}])
-    study.run(study.Job("double-pendulum", "none", 1, "zero-shot", 0), tmp_path)
-    (row,) = study.collected(tmp_path).to_dict("records")
-    assert (row["commit"], row["return"], row["target"]) == ("0123abc", 1.0, 1)
+
+    def transfer(*_: object, every: tuple[int, ...], **__: object) -> list[dict[str, float]]:
+        made.append(every)
+        spent = {"updates": 0, "source_steps": 0, "seconds": 0.0}
+        return [{"steps": steps, "return": 1.0, **spent} for steps in (0, *every)]
+
+    monkeypatch.setattr(study, "transfer", transfer)
+    return made
 
 
-def test_exact_and_noisy_runs_of_one_folder_are_kept_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(study, "source_agent", lambda *_: ("agent", None))
-    monkeypatch.setattr(study, "transfer", lambda *_, **__: [{"return": 1.0}])
+def make(folder: Path, *jobs: study.Job) -> None:
+    run_jobs(partial(study.run, folder=folder), jobs, folder / "runs", 1, current=study.long_enough)
+
+
+def test_exact_and_noisy_runs_of_one_folder_are_kept_apart(tmp_path: Path, ran: list[tuple[int, ...]]) -> None:
+    make(tmp_path, *(study.Job("double-pendulum", "none", 1, "zero-shot", 0, sensors) for sensors in (0.0, 0.001)))
     for sensors in (0.0, 0.001):
-        study.run(study.Job("double-pendulum", "none", 1, "zero-shot", 0, sensors), tmp_path)
-    for sensors in (0.0, 0.001):
-        assert study.collected(tmp_path, sensors)["sensors"].tolist() == [sensors]
+        assert study.collected(tmp_path / "runs", sensors)["sensors"].tolist() == [sensors]
 
 
-def test_a_run_of_a_smaller_budget_is_not_taken_for_a_longer_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_run_of_a_smaller_budget_is_not_taken_for_a_longer_one(tmp_path: Path, ran: list[tuple[int, ...]]) -> None:
+    for budget in (250, 500, 250, None):
+        make(tmp_path, study.Job("double-pendulum", "none", 0, "RPTO-ensemble", 0, budget=budget))
+    assert ran == [(250,), (250, 500), study.SHORT]
+    assert study.collected(tmp_path / "runs")["steps"].tolist() == [0, *study.SHORT]
+
+
+def test_the_command_writes_the_table_of_all_runs(
+    tmp_path: Path, ran: list[tuple[int, ...]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    job = study.Job("double-pendulum", "none", 0, "SAC-warm", 0)
-    path = tmp_path / f"{job.name}.json"
-    path.write_text(json.dumps([{"steps": 0}, {"steps": 250}]))
-    monkeypatch.setattr(study, "source_agent", lambda *_: ("agent", None))
-    monkeypatch.setattr(study, "transfer", lambda *_, every, **__: [{"steps": steps} for steps in (0, *every)])
-    study.run(job, tmp_path, 250)
-    assert len(json.loads(path.read_text())) == 2
-    study.run(job, tmp_path, 500)
-    assert [row["steps"] for row in json.loads(path.read_text())] == [0, 250, 500]
-
-
-def test_finished_runs_are_not_repeated_and_are_collected(tmp_path: Path) -> None:
-    job = study.Job("double-pendulum", "none", 0, "zero-shot", 0)
-    path = tmp_path / f"{job.name}.json"
-    path.write_text(json.dumps([{"task": "double-pendulum", "return": 1.0, "steps": 0}]))
-    (tmp_path / "oracle_double-pendulum_none_0.json").write_text(json.dumps({"return": 2.0, "steps": 100_000}))
-    assert study.run(job, tmp_path) == path
-    assert study.oracle("double-pendulum", "none", 0, tmp_path) == 2.0
-    assert study.oracles(tmp_path) == {("double-pendulum", "none", 0): 2.0}
-    assert study.collected(tmp_path)["return"].tolist() == [1.0]
+    arguments = ["--runs", str(tmp_path), "--workers", "1", "--tasks", "hopper", "--shifts", "none", "--targets", "0"]
+    some = [*arguments, "--methods", "SAC-warm", "zero-shot", "--seeds", "2"]
+    assert main(["closed_loop", *some]) == 0
+    assert len(ran) == 5, "four runs and an oracle"
+    assert main(["closed_loop", *arguments, "--seeds", "0"]) == 0
+    rows = read_table(tmp_path / "table.csv")
+    assert {row["method"] for row in rows} == {"SAC-warm", "zero-shot", "oracle"}
+    assert json.loads((tmp_path / "table.json").read_text())["targets"] == study.fingerprint()
+    capsys.readouterr()
+    assert main(["closed_loop", "report", str(tmp_path / "table.csv")]) == 0
+    assert "SAC-warm" in capsys.readouterr().out
+    assert (tmp_path / "table.png").exists()

@@ -3,12 +3,12 @@
 import csv
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
+from benchmarks import RESULTS
 from benchmarks.machines.machines import MACHINES, find_measured
 from sb3_rpto.effects import LIBRARY, Simulation, declare
 from sb3_rpto.effects.model import load_model
@@ -16,7 +16,6 @@ from sb3_rpto.sysid import Measurements, Report, trace
 from sb3_rpto.sysid.shooting.prediction_errors import horizon_errors
 from sb3_rpto.sysid.shooting.windows import discretised, noise_levels
 
-RESULTS = Path(__file__).parents[2] / "benchmarks" / "results" / "machines"
 #: What a first attempt elsewhere reached, in rad: RMSE at 0.5 s on test and other runs, mean error of whole runs.
 FIRST_ATTEMPT = {
     ("simple_pendulum", "test", "0.5", "rmse"): [0.038],
@@ -46,8 +45,9 @@ def test_a_real_pendulum_lacks_dry_friction() -> None:
 
 
 def committed(name: str) -> tuple[dict, list[dict[str, str]]]:
-    with (RESULTS / f"{name}.csv").open(newline="", encoding="utf-8") as stream:
-        return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")), list(csv.DictReader(stream))
+    found = json.loads((RESULTS / "machines.json").read_text(encoding="utf-8"))["found"][f"{name}_0"]
+    with (RESULTS / "machines.csv").open(newline="", encoding="utf-8") as stream:
+        return found, [row for row in csv.DictReader(stream) if row["machine"] == name]
 
 
 def corrected(found: dict, model) -> Simulation:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.tracing.first_trace import GUSTS
 from benchmarks.tracing.robots import CAUSES, KINDS, NOTHING, ROBOTS, Job, fits, make_target, run
+from benchmarks.tracing.targets import GUSTS
 from sb3_rpto.effects import Declared, Effect
 
 
@@ -74,12 +74,8 @@ def test_gusts_push_at_a_motor_by_a_share_of_its_force() -> None:
 
 
 @pytest.mark.slow
-def test_what_is_put_in_is_found_and_the_trace_is_kept(tmp_path: Path) -> None:
-    job = Job("InvertedPendulum-v5", "coulomb_friction")
-    row = run(job, tmp_path)
+def test_what_is_put_in_is_found(tmp_path: Path) -> None:
+    (row,) = run(Job("InvertedPendulum-v5", "coulomb_friction"), tmp_path)
     assert (row["verdict"], row["there"], row["named"], row["right"]) == ("explained", 1, 1, 1)
     assert row["declared_error_max"] < 1e-3
-    written = next(tmp_path.glob("*.json"))
-    written.write_text(written.read_text().replace('"explained"', '"read again"'))
-    assert run(job, tmp_path)["verdict"] == "read again"
     assert np.isfinite(row["seconds"])

@@ -8,7 +8,8 @@ import pytest
 import torch as th
 from stable_baselines3.common.logger import configure
 
-from benchmarks import speed
+from benchmarks import RESULTS, speed
+from benchmarks.runner import read_table
 from benchmarks.speed import cases, timing
 from benchmarks.speed.cases import ACTION, Case, Stage, random_rows
 from benchmarks.speed.plain import PlainEnsemble, PlainRPTO
@@ -120,7 +121,7 @@ def test_a_case_becomes_a_row_and_a_line_of_the_table(monkeypatch):
     row = {"threads": 1, **speed.measure(case, 2)}
     assert row["milliseconds"] == {"plain": 400, "ours": 150, "floor": 50}
     assert (row["ratio"], row["range"], row["floor_share"]) == (3, [2, 4], 0.375)
-    text = speed.table([row], [])
+    text = speed.table([row])
     assert "| 3.00 [2.00, 4.00] | 38% | 2.2, 60% | no |" in text
 
 
@@ -149,9 +150,15 @@ def test_the_command_writes_figures_and_manifest(tmp_path, monkeypatch):
         speed, "growth", lambda *_: [{"what": "peak memory", "value": 10, "megabytes": {"SB3": 5, "ours": 6}}]
     )
     before = th.get_num_threads()
-    assert speed.main(["--out", str(tmp_path / "new"), "--threads", "1"]) == 0
+    assert speed.main(["--out", str(tmp_path / "new" / "speed"), "--threads", "1"]) == 0
     assert th.get_num_threads() == before
-    found = json.loads((tmp_path / "new" / "speed.json").read_text())
-    assert found["cases"][0]["case"] == "columns of the fit"
-    assert found["manifest"]["gpu"] == "unmeasured"
-    assert "| peak memory | 10 | 5 MB | 6 MB |" in (tmp_path / "new" / "speed.md").read_text()
+    rows = read_table(tmp_path / "new" / "speed.csv")
+    assert rows[0]["case"] == "columns of the fit"
+    assert json.loads((tmp_path / "new" / "speed.json").read_text())["gpu"] == "unmeasured"
+    assert "| peak memory | 10 | 5 MB | 6 MB |" in speed.table(rows)
+
+
+def test_the_committed_table_is_printed_as_it_was_measured():
+    text = speed.table(read_table(RESULTS / "speed.csv"))
+    assert text.count("| yes |") > 3
+    assert "| update, batch | 1,024 |" in text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,13 +21,16 @@ import pytest
 from stable_baselines3 import SAC
 from tiny_suite import PLACE, SUITE, returns, run_here, stored
 
+from benchmarks import RESULTS
+from benchmarks.__main__ import main
+from benchmarks.provenance import constructor_arguments
+from benchmarks.runner import read_table
 from benchmarks.transfer import sources, sweep, tables
-from benchmarks.transfer.plan import Place, Variant, jobs
+from benchmarks.transfer.plan import Job, Place, Variant, jobs
 from benchmarks.transfer.suites import SMOKE, SUITES
-from sb3_rpto import RPTO, cli
+from sb3_rpto import RPTO
 from sb3_rpto.baselines.slbo import SLBO
 from sb3_rpto.buffers import load_transitions
-from sb3_rpto.evaluation.provenance import constructor_arguments
 
 ROOT = Path(__file__).parents[2]
 make_source, make_target = sweep.worlds("ContinuousCartPole", "limb-x2")
@@ -49,38 +52,14 @@ def _sources(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def worked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the runs that were made in this process."""
     names: list[str] = []
-    original = sweep.learning_curve
+    original = sweep.transfer_once
 
-    def counted(task: sweep.Task, *args: Any) -> list[dict[str, Any]]:
-        names.append(task.job.name)
-        return original(task, *args)
+    def counted(job: Job, **given: Any) -> dict[str, Any]:
+        names.append(job.name)
+        return original(job, **given)
 
-    monkeypatch.setattr(sweep, "learning_curve", counted)
+    monkeypatch.setattr(sweep, "transfer_once", counted)
     return names
-
-
-def die_at_one(item: int) -> int:
-    if item == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return -item
-
-
-@pytest.mark.slow
-def test_a_process_that_the_system_ends_takes_no_other_run_with_it() -> None:
-    answers = list(sweep.spread(die_at_one, range(5), 2, "joblib", lost=lambda item: 100 + item))
-    assert sorted(answers) == [-4, -3, -2, 0, 101]
-    with pytest.raises(RuntimeError, match="terminated"):
-        list(sweep.spread(die_at_one, range(3), 2, "joblib"))
-
-
-def test_a_run_whose_process_was_ended_is_one_that_failed(tmp_path: Path) -> None:
-    job = jobs(SUITE)[0]
-    (tmp_path / "agent.zip").write_text("")
-    task = sweep.Task(job, str(tmp_path / "agent.zip"), None, str(tmp_path))
-    result = sweep.killed(task)
-    assert "ended by the system" in result["error"]
-    assert json.loads((tmp_path / f"{job.name}.json").read_text()) == result
-    assert sweep.stored(task) is None  # so it is made again
 
 
 # --- resuming -------------------------------------------------------------------------------------------------------
@@ -99,14 +78,9 @@ def test_finished_runs_are_not_repeated_and_torn_failed_or_other_ones_are(tmp_pa
     assert returns(again) == returns(first)
 
     worked.clear()
-    ran = {"commit": "the one that ran", "versions": {"torch": "1.0"}}
-    manifest = tmp_path / "manifest.json"
-    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), **ran}))
     sweep.run(SUITE, tmp_path, workers=1, seeds=1)
     assert worked == []
-    known = json.loads(manifest.read_text())
-    assert {name: known[name] for name in ran} == ran
-    assert known["planned"] == len(jobs(SUITE))
+    assert json.loads((tmp_path / "manifest.json").read_text())["planned"] == len(jobs(SUITE))
     longer = replace(SUITE, places=(replace(PLACE, points=(10, 30), oracle_steps=PLACE.oracle_steps),))
     sweep.run(longer, tmp_path, workers=1, only="sac-warm_1")
     assert worked == ["ContinuousCartPole_limb-x2_sac-warm_1"]
@@ -116,8 +90,7 @@ def test_finished_runs_are_not_repeated_and_torn_failed_or_other_ones_are(tmp_pa
 
 @pytest.mark.parametrize("suite", ["quick", "ablation", "further"])
 def test_the_committed_runs_are_those_that_their_suite_plans(suite: str) -> None:
-    folder = ROOT / "benchmarks" / "results" / f"transfer_{suite}" / "runs"
-    found = {path.stem: json.loads(path.read_text())["job"] for path in folder.glob("*.json")}
+    found = {result["name"]: result["job"] for result in read_table(RESULTS / f"transfer_{suite}.csv")}
     planned = {job.name: job.to_json() for job in jobs(SUITES[suite])}
     assert found
     assert {name: planned.get(name) for name in found} == found, "they would be made again"
@@ -132,14 +105,16 @@ def test_a_run_with_settings_that_sac_writes_into_is_not_repeated(tmp_path: Path
         assert json.loads((tmp_path / "runs" / f"{worked[0]}.json").read_text())["error"] is None
 
 
-def test_a_run_from_another_source_agent_is_made_again(made: Path, tmp_path: Path) -> None:
-    (job, *_) = jobs(SUITE)
-    agent = tmp_path / "agent.zip"
-    agent.write_bytes((made / "sources" / f"{PLACE.agent}.zip").read_bytes())
-    task = sweep.Task(job, str(agent), None, str(made / "runs"))
-    assert sweep.stored(task) is not None
-    agent.write_bytes(b"another")
-    assert sweep.stored(task) is None
+def test_a_run_from_another_source_agent_is_made_again(
+    made: Path, tmp_path: Path, worked: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(made, tmp_path / "suite")
+    name = jobs(SUITE)[0].name
+    sweep.run(SUITE, tmp_path / "suite", workers=1, only=name)
+    assert worked == []
+    monkeypatch.setattr(sweep, "digest", lambda path: "another")
+    sweep.run(SUITE, tmp_path / "suite", workers=1, only=name)
+    assert worked == [name]
 
 
 @pytest.mark.slow
@@ -150,13 +125,13 @@ def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, worked: list[str], 
         sys.path[:0] = [{str(Path(__file__).parent)!r}]
         from benchmarks.transfer import sweep
         from tiny_suite import SUITE
-        original, begun = sweep.learning_curve, []
-        def dying(task, *args):
-            begun.append(task)
+        original, begun = sweep.transfer_once, []
+        def dying(job, **given):
+            begun.append(job)
             if len(begun) == 2:
                 os.kill(os.getpid(), signal.SIGKILL)
-            return original(task, *args)
-        sweep.learning_curve = dying
+            return original(job, **given)
+        sweep.transfer_once = dying
         sweep.run(SUITE, {str(tmp_path)!r}, workers=1)
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True)
@@ -175,10 +150,11 @@ def test_a_failed_run_is_kept_said_and_does_not_stop_the_others(
 ) -> None:
     broken = replace(PLACE, variants=(*PLACE.variants, Variant("broken", "slbo", {"iterations": 0}, seeds=1)))
     monkeypatch.setitem(SUITES, "smoke", replace(SUITE, places=(broken,)))
-    assert cli.main(["benchmark", "transfer", "--suite", "smoke", "--out", str(tmp_path), "--workers", "1"]) == 1
+    assert main(["transfer", "--suite", "smoke", "--runs", str(tmp_path), "--workers", "1"]) == 1
     said = capsys.readouterr()
     assert "4 of 5 runs are done" in said.out
     assert "_broken_0 failed: ValueError: iterations must be a positive integer" in said.err
+    assert "4 of 5 runs are done" in (tmp_path / "table.md").read_text()
     result = json.loads((tmp_path / "runs" / "ContinuousCartPole_limb-x2_broken_0.json").read_text())
     assert "Traceback" in result["error"]
     assert result["rows"] == []
@@ -192,13 +168,6 @@ def test_agents_and_oracles_are_said_before_the_first_run(tmp_path: Path, capsys
         "[0/1] oracles: found, or trained now and kept",
         "[1/1] oracle of ContinuousCartPole_limb-x2 is there",
     ]
-
-
-def test_time_left_goes_by_what_runs_were_expected_to_cost(capsys: pytest.CaptureFixture[str]) -> None:
-    cheap, dear = jobs(SUITE)[:2]
-    say = sweep._Progress([replace(cheap, seconds=10.0), replace(dear, seconds=600.0)], workers=2)
-    say({"name": cheap.name, "seconds": 20.0, "error": None, "rows": [{"return": 12.3}]})
-    assert capsys.readouterr().err == f"[1/2, 10 min left] {cheap.name}: 12, 20 s\n"
 
 
 # --- what a result holds --------------------------------------------------------------------------------------------
@@ -233,7 +202,7 @@ def test_the_manifest_is_what_a_report_needs(made: Path) -> None:
     reference = manifest["references"]["ContinuousCartPole_limb-x2"]
     assert reference["oracle"] >= reference["zero_shot"]
     assert reference["steps"] == PLACE.oracle_steps
-    assert cli.main(["benchmark", "report", str(made)]) == 0
+    assert main(["transfer", "report", str(made)]) == 0
 
 
 def test_all_arguments_of_an_algorithm_are_read_off_it() -> None:
@@ -319,7 +288,7 @@ def test_list_prints_runs_and_costs_and_starts_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     arguments = ["--suite", "quick", "--only", "InvertedDouble.*rpto", "--seeds", "2", "--workers", "2", "--list"]
-    assert cli.main(["benchmark", "transfer", *arguments]) == 0
+    assert main(["transfer", *arguments]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 * 3 + 1
     assert "min on 2 cores" in lines[-1]
@@ -335,12 +304,6 @@ def test_a_folder_holds_one_suite(made: Path) -> None:
 def test_bad_arguments_are_refused(argument: str, value: Any, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=f"{argument} is|matches"):
         sweep.run(SUITE, tmp_path, **{argument: value})
-
-
-def test_a_missing_backend_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"pip install -e '\.\[ray\]'"):
-        sweep.run(SUITE, tmp_path, backend="ray")
 
 
 def test_a_place_has_agents_for_its_task_alone(made: Path, tmp_path: Path) -> None:

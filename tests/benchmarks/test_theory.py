@@ -1,14 +1,19 @@
 """Lemma 1, the inequalities with their counterexamples, and the sample estimators, against exact solves."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks import theory
-from benchmarks.theory import Setting, TabularMDP
+from benchmarks.__main__ import main
+from benchmarks.theory import bounds, search, table
+from benchmarks.theory import mdp as tabular
+from benchmarks.theory.bounds import Setting
+from benchmarks.theory.mdp import TabularMDP
+from sb3_rpto.evaluation import relativity_gap
 
 ONE_ACTION = np.ones((3, 1))
 
@@ -39,7 +44,7 @@ def leak_setting(target: TabularMDP, source: TabularMDP, old_source: TabularMDP 
 
 
 def draw(seed: int, index: int) -> Setting:
-    return theory.random_setting(np.random.default_rng([seed, index]), index)
+    return search.random_setting(np.random.default_rng([seed, index]), index)
 
 
 # --------------------------------------------------------------------------------- exact solves
@@ -47,18 +52,18 @@ def draw(seed: int, index: int) -> Setting:
 
 def test_values_in_closed_form():
     mdp = leak(0.3, 0.0)
-    v, q, advantage = theory.values(mdp, ONE_ACTION)
+    v, q, advantage = tabular.values(mdp, ONE_ACTION)
     np.testing.assert_allclose(v, [0.3 * 2 / (1 - 0.5 * 0.7), 2, -2])
     np.testing.assert_allclose(q[:, 0], v)
     np.testing.assert_allclose(advantage, 0, atol=1e-14)
-    assert theory.expected_return(mdp, ONE_ACTION) == pytest.approx(v[0])
+    assert tabular.expected_return(mdp, ONE_ACTION) == pytest.approx(v[0])
 
 
 def test_occupancy_is_the_discounted_sum_of_state_distributions():
     setting = draw(0, 0)
     mdp, policy = replace(setting.source, gamma=0.5), setting.policy
-    total = sum(0.5 * 0.5**t * theory.state_distribution(mdp, policy, t) for t in range(60))
-    np.testing.assert_allclose(theory.occupancy(mdp, policy), total, atol=1e-14)
+    total = sum(0.5 * 0.5**t * tabular.state_distribution(mdp, policy, t) for t in range(60))
+    np.testing.assert_allclose(tabular.occupancy(mdp, policy), total, atol=1e-14)
 
 
 @given(st.integers(0, 10_000), st.integers(2, 6), st.floats(0, 1))
@@ -66,7 +71,7 @@ def test_perturb_reaches_the_distance_in_every_row(seed: int, n: int, fraction: 
     rng = np.random.default_rng(seed)
     rows = rng.dirichlet(np.full(n, 0.3), (3, 2))
     distance = fraction * (1 - 1 / n)
-    moved = theory.perturb(rng, rows, distance)
+    moved = tabular.perturb(rng, rows, distance)
     np.testing.assert_allclose(0.5 * np.abs(moved - rows).sum(-1), distance, atol=1e-12)
     np.testing.assert_allclose(moved.sum(-1), 1)
     assert (moved >= -1e-15).all()
@@ -75,7 +80,7 @@ def test_perturb_reaches_the_distance_in_every_row(seed: int, n: int, fraction: 
 def test_wrong_input_is_named():
     mdp = leak(0.3, 0.0)
     with pytest.raises(ValueError, match="distance"):
-        theory.perturb(np.random.default_rng(0), np.full((2, 2), 0.5), 0.6)
+        tabular.perturb(np.random.default_rng(0), np.full((2, 2), 0.5), 0.6)
     with pytest.raises(ValueError, match="gamma"):
         replace(mdp, gamma=1.0)
     with pytest.raises(ValueError, match="transition must hold probabilities"):
@@ -85,7 +90,7 @@ def test_wrong_input_is_named():
     with pytest.raises(ValueError, match="reward"):
         replace(mdp, reward=mdp.reward[:, 0])
     with pytest.raises(ValueError, match="policy"):
-        theory.values(mdp, np.full((3, 2), 0.5))
+        tabular.values(mdp, np.full((3, 2), 0.5))
 
 
 # --------------------------------------------------------------------------------- Lemma 1
@@ -96,95 +101,95 @@ def test_wrong_input_is_named():
 def test_lemma_1_is_exact(seed: int, index: int):
     world = draw(seed, index)
     target, source, policy, old = world.target, world.source, world.policy, world.old_policy
-    j_target, j_source = theory.expected_return(target, policy), theory.expected_return(source, policy)
-    j_old = theory.expected_return(source, old)
-    assert theory.dynamics_gap(target, source, policy) == pytest.approx(j_target - j_source, abs=1e-10)
-    assert theory.policy_gap(source, policy, old) == pytest.approx(j_source - j_old, abs=1e-10)
-    assert theory.relativity_gap(target, source, policy, old) == pytest.approx(j_target - j_old, abs=1e-10)
+    j_target, j_source = tabular.expected_return(target, policy), tabular.expected_return(source, policy)
+    j_old = tabular.expected_return(source, old)
+    assert tabular.dynamics_gap(target, source, policy) == pytest.approx(j_target - j_source, abs=1e-10)
+    assert tabular.policy_gap(source, policy, old) == pytest.approx(j_source - j_old, abs=1e-10)
+    assert tabular.relativity_gap(target, source, policy, old) == pytest.approx(j_target - j_old, abs=1e-10)
 
 
 def test_lemma_1_needs_one_initial_distribution():
     source, target = leak(0.3, 0.0), replace(leak(0.3, 0.0), initial=np.array([0.0, 1.0, 0.0]))
-    difference = theory.expected_return(target, ONE_ACTION) - theory.expected_return(source, ONE_ACTION)
+    difference = tabular.expected_return(target, ONE_ACTION) - tabular.expected_return(source, ONE_ACTION)
     same_dynamics = replace(target, initial=source.initial)
-    assert theory.dynamics_gap(same_dynamics, source, ONE_ACTION) == pytest.approx(0) != difference
+    assert tabular.dynamics_gap(same_dynamics, source, ONE_ACTION) == pytest.approx(0) != difference
     with pytest.raises(ValueError, match="initial differs"):
-        theory.dynamics_gap(target, source, ONE_ACTION)
+        tabular.dynamics_gap(target, source, ONE_ACTION)
 
 
 # --------------------------------------------------------------------------------- inequalities
 
 
-@pytest.mark.parametrize("name", sorted(set(theory.STATEMENTS) - FAILS))
+@pytest.mark.parametrize("name", sorted(set(table.STATEMENTS) - FAILS))
 def test_statement_holds_on_every_random_mdp(name: str):
-    statement = theory.STATEMENTS[name]
+    statement = table.STATEMENTS[name]
     assert all(statement(draw(1, index)).holds for index in range(240))
 
 
 @pytest.mark.parametrize("name", sorted(name for name in FAILS if "marginal" not in name and "appendix" not in name))
 def test_statement_fails_on_some_random_mdp(name: str):
-    assert not all(theory.STATEMENTS[name](draw(0, index)).holds for index in range(500))
+    assert not all(table.STATEMENTS[name](draw(0, index)).holds for index in range(500))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in theory.STATEMENTS if name not in FAILS and "tight" in name])
+@pytest.mark.parametrize("name", [name for name in table.STATEMENTS if name not in FAILS and "tight" in name])
 def test_tight_constants_resist_a_search(name: str):
-    bound, _ = theory.worst_case(theory.STATEMENTS[name], seed=0, steps=1200)
+    bound, _ = search.worst_case(table.STATEMENTS[name], seed=0, steps=1200)
     assert bound.holds
 
 
 def test_tight_is_never_above_printed():
     for index in range(120):
         world = draw(2, index)
-        for statement in (theory.theorem_2, theory.policy_improvement, theory.proposition_1):
+        for statement in (bounds.theorem_2, bounds.policy_improvement, bounds.proposition_1):
             assert statement(world, "tight").rhs <= statement(world).rhs + 1e-12
-        assert theory.theorem_3(world, "tight").rhs <= theory.theorem_3(world, "corrected").rhs + 1e-12
-        assert theory.proposition_1(world).rhs <= theory.proposition_1(world, constant="main").rhs
+        assert bounds.theorem_3(world, "tight").rhs <= bounds.theorem_3(world, "corrected").rhs + 1e-12
+        assert bounds.proposition_1(world).rhs <= bounds.proposition_1(world, constant="main").rhs
 
 
 def test_state_and_value_constants_are_attained():
     world = leak_setting(leak(0.2, 0.0), leak(0.0, 0.2))
-    assert theory.state_distribution_lemma(world, 1, "dynamics").ratio == pytest.approx(1)
-    assert theory.state_distribution_lemma(world, 4, "dynamics", "tight").ratio == pytest.approx(1)
-    assert theory.value_difference_lemma(world, 0, "dynamics", "tight").ratio == pytest.approx(1)
+    assert bounds.state_distribution_lemma(world, 1, "dynamics").ratio == pytest.approx(1)
+    assert bounds.state_distribution_lemma(world, 4, "dynamics", "tight").ratio == pytest.approx(1)
+    assert bounds.value_difference_lemma(world, 0, "dynamics", "tight").ratio == pytest.approx(1)
 
 
 def test_theorem_3_fails_as_printed():
     # phi' values state 0 far too highly, so L is too small; a fixed policy has delta_2 = 0 and leaves no allowance
     world = leak_setting(leak(0.21, 0.0), leak(0.20, 0.0), leak(0.9, 0.0))
-    main, target = theory.theorem_3(world), theory.theorem_3(world, delta="target")
+    main, target = bounds.theorem_3(world), bounds.theorem_3(world, delta="target")
     assert (main.lhs, main.rhs) == (pytest.approx(0.0101, abs=1e-4), 0)
     assert not main.holds
     assert target.rhs == pytest.approx(0.002)
     assert not target.holds
-    assert theory.theorem_3(world, "corrected").holds
-    assert theory.theorem_3(world, "tight").holds
+    assert bounds.theorem_3(world, "corrected").holds
+    assert bounds.theorem_3(world, "tight").holds
 
 
 def test_theorem_3_fails_with_the_step_for_both_deltas():
     world = leak_setting(leak(0.9, 0.0), leak(0.20, 0.0), leak(0.21, 0.0))
     mirrored = leak_setting(leak(0.9, 0.0), leak(0.21, 0.0), leak(0.22, 0.0))
-    assert not theory.theorem_3(world, delta="step").holds
-    assert not theory.theorem_3(mirrored, delta="step").holds
-    assert theory.theorem_3(world, "corrected").holds
+    assert not bounds.theorem_3(world, delta="step").holds
+    assert not bounds.theorem_3(mirrored, delta="step").holds
+    assert bounds.theorem_3(world, "corrected").holds
 
 
 def test_value_lemma_grows_with_t_only_for_marginals_and_then_faster_than_printed():
     world = leak_setting(leak(0.05, 0.0, gamma=0.05), leak(0.0, 0.05, gamma=0.05))
-    printed = theory.value_difference_lemma(world, 3, "dynamics", reading="marginal")
+    printed = bounds.value_difference_lemma(world, 3, "dynamics", reading="marginal")
     assert printed.lhs > 2.5 * printed.rhs
-    assert theory.value_difference_lemma(world, 3, "dynamics", "corrected", "marginal").holds
-    state = [theory.value_difference_lemma(world, t, "dynamics").lhs for t in (0, 3)]
+    assert bounds.value_difference_lemma(world, 3, "dynamics", "corrected", "marginal").holds
+    state = [bounds.value_difference_lemma(world, t, "dynamics").lhs for t in (0, 3)]
     assert state[1] == pytest.approx(state[0], rel=1e-12)
-    assert theory.value_difference_lemma(world, 3, "dynamics", "tight").holds
+    assert bounds.value_difference_lemma(world, 3, "dynamics", "tight").holds
 
 
 def test_r_max_must_be_absolute():
     world = draw(0, 4)  # its rewards are never positive
     assert world.r_max("literal") < 0 < world.r_max("printed")
     for statement in (
-        lambda variant: theory.theorem_2(world, variant),
-        lambda variant: theory.value_difference_lemma(world, 0, "dynamics", variant),
+        lambda variant: bounds.theorem_2(world, variant),
+        lambda variant: bounds.value_difference_lemma(world, 0, "dynamics", variant),
     ):
         assert not statement("literal").holds
         assert statement("printed").holds
@@ -195,24 +200,24 @@ def test_policy_improvement_needs_actions_of_the_new_policy():
     mdp = TabularMDP(np.full((2, 2, 2), 0.5), np.ones((2, 2, 2)) * [[[1.0], [-1.0]]], np.array([0.5, 0.5]), 0.1)
     new, old = np.tile([0.45, 0.55], (2, 1)), np.full((2, 2), 0.5)
     world = Setting(mdp, mdp, mdp, new, old)
-    printed = theory.policy_improvement(world)
+    printed = bounds.policy_improvement(world)
     assert printed.lhs == pytest.approx(1 / 9)
     assert printed.rhs == pytest.approx(0.001 / 0.81)
-    assert theory.policy_improvement(world, "corrected").holds
+    assert bounds.policy_improvement(world, "corrected").holds
 
 
 def test_proposition_1_is_exact_for_an_unchanged_policy():
     # the paper says that C cannot vanish with delta_2; its own C does not, but the error that it bounds does
     world = draw(0, 0)
     world = replace(world, old_policy=world.policy)
-    tight, printed = theory.proposition_1(world, "tight"), theory.proposition_1(world)
+    tight, printed = bounds.proposition_1(world, "tight"), bounds.proposition_1(world)
     assert tight.lhs == pytest.approx(0, abs=1e-12)
     assert tight.rhs == 0 < printed.rhs
 
 
 @pytest.mark.parametrize("variant", ["printed", "corrected"])
 def test_telescoping_equation(variant: str):
-    bound = theory.telescoping(leak_setting(leak(0.3, 0.0), leak(0.1, 0.0)), variant)
+    bound = bounds.telescoping(leak_setting(leak(0.3, 0.0), leak(0.1, 0.0)), variant)
     assert bound.holds == (variant == "corrected")
 
 
@@ -232,15 +237,16 @@ def test_bounds_are_vacuous_at_the_usual_discount():
             TabularMDP(np.repeat(m.transition, 2, 1), np.repeat(m.reward, 2, 1), m.initial, m.gamma)
             for m in (world.target, world.source)
         ]
-        bound = theory.theorem_2(Setting(doubled[0], doubled[1], doubled[1], *policies))
+        bound = bounds.theorem_2(Setting(doubled[0], doubled[1], doubled[1], *policies))
         any_gap = 2 / (1 - 0.99)
         assert bound.rhs > 50 * any_gap
 
 
-def test_table(capsys: pytest.CaptureFixture[str]):
-    theory.main(["--n", "12", "--seed", "3", "--search", "8"])
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 1 + len(theory.STATEMENTS)
+def test_table(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    runs = ["--workers", "1", "--runs", str(tmp_path)]
+    assert main(["theory", "--n", "12", "--seed", "3", "--search", "8", *runs]) == 0
+    lines = capsys.readouterr().out.splitlines()[:-1]
+    assert len(lines) == 1 + len(table.STATEMENTS)
     for line in lines[1:]:
         holds, fails = (int(line[start : start + 7]) for start in (40, 47))
         assert holds + fails == 12
@@ -268,10 +274,10 @@ def roll(rng: np.random.Generator, mdp: TabularMDP, policy: np.ndarray, n: int, 
 
 def small_world() -> Setting:
     rng = np.random.default_rng(5)
-    source = theory.random_mdp(rng, 4, 3, 0.8)
-    target = replace(source, transition=theory.perturb(rng, source.transition, 0.4))
-    old = theory.random_policy(rng, 4, 3)
-    return Setting(target, source, source, theory.perturb(rng, old, 0.4), old)
+    source = tabular.random_mdp(rng, 4, 3, 0.8)
+    target = replace(source, transition=tabular.perturb(rng, source.transition, 0.4))
+    old = tabular.random_policy(rng, 4, 3)
+    return Setting(target, source, source, tabular.perturb(rng, old, 0.4), old)
 
 
 @pytest.mark.parametrize("n", [100, 4000])
@@ -279,11 +285,11 @@ def test_dynamics_gap_estimate_converges(n: int):
     world = small_world()
     source, policy = world.source, world.policy
     s, a, following = roll(np.random.default_rng(n), world.target, policy, n, steps=90)
-    v, q, _ = theory.values(source, policy)
-    estimate = theory.dynamics_gap_estimate(
+    v, q, _ = tabular.values(source, policy)
+    estimate = relativity_gap.dynamics_gap_estimate(
         source.reward[s, a, following], v[following], q[s, a], np.zeros_like(v[s]), source.gamma
     )
-    exact = theory.dynamics_gap(world.target, source, policy)
+    exact = tabular.dynamics_gap(world.target, source, policy)
     assert estimate.n_episodes == n
     assert abs(estimate.mean - exact) < 4 * estimate.standard_error
     assert n == 100 or abs(exact) > 8 * estimate.standard_error  # so zero would not pass
@@ -293,9 +299,9 @@ def test_dynamics_gap_estimate_converges(n: int):
 def test_policy_gap_estimate_converges(n: int):
     world = small_world()
     s, a, _ = roll(np.random.default_rng(n), world.source, world.policy, n, steps=90)
-    v, q, _ = theory.values(world.source, world.old_policy)
-    estimate = theory.policy_gap_estimate(q[s, a], v[s], world.gamma)
-    exact = theory.policy_gap(world.source, world.policy, world.old_policy)
+    v, q, _ = tabular.values(world.source, world.old_policy)
+    estimate = relativity_gap.policy_gap_estimate(q[s, a], v[s], world.gamma)
+    exact = tabular.policy_gap(world.source, world.policy, world.old_policy)
     assert abs(estimate.mean - exact) < 4 * estimate.standard_error
     assert n == 100 or abs(exact) > 8 * estimate.standard_error
 
@@ -306,11 +312,11 @@ def test_dynamics_gap_estimate_stops_at_a_termination():
     transition, reward = world.source.transition.copy(), world.source.reward.copy()
     transition[3], reward[3] = np.eye(4)[3], 0
     source = TabularMDP(transition, reward, np.array([0.5, 0.5, 0, 0]), 0.8)
-    shifted = theory.perturb(np.random.default_rng(0), transition, 0.3)
+    shifted = tabular.perturb(np.random.default_rng(0), transition, 0.3)
     shifted[3] = np.eye(4)[3]
     target = replace(source, transition=shifted)
     s, a, following = roll(np.random.default_rng(1), target, world.policy, 4000, steps=90)
-    v, q, _ = theory.values(source, world.policy)
+    v, q, _ = tabular.values(source, world.policy)
     critic = np.where(np.arange(4) == 3, 1000.0, v)
     lengths = [1 + int(np.argmax(row)) if row.any() else row.size for row in following == 3]
     columns = zip(
@@ -319,8 +325,8 @@ def test_dynamics_gap_estimate_stops_at_a_termination():
             for x, y, z, n in zip(s, a, following, lengths)
         ]
     )
-    estimate = theory.dynamics_gap_estimate(*(list(column) for column in columns), gamma=0.8)
-    exact = theory.dynamics_gap(target, source, world.policy)
+    estimate = relativity_gap.dynamics_gap_estimate(*(list(column) for column in columns), gamma=0.8)
+    exact = tabular.dynamics_gap(target, source, world.policy)
     assert len(set(lengths)) > 5
     assert abs(estimate.mean - exact) < 4 * estimate.standard_error
 
@@ -333,42 +339,44 @@ def test_soft_values_give_the_gap_of_soft_returns():
     def soft(mdp: TabularMDP, entropy: np.ndarray) -> TabularMDP:
         return replace(mdp, reward=mdp.reward + alpha * entropy[:, None, None])
 
-    v, q, _ = theory.values(soft(world.source, entropies[0]), world.policy)
+    v, q, _ = tabular.values(soft(world.source, entropies[0]), world.policy)
     soft_q = q - alpha * entropies[0][:, None]  # SAC's Q(s, a) leaves out the entropy at s
     s, a, following = roll(np.random.default_rng(0), world.target, world.policy, 4000, steps=90)
-    estimate = theory.dynamics_gap_estimate(
+    estimate = relativity_gap.dynamics_gap_estimate(
         world.source.reward[s, a, following], v[following], soft_q[s, a], np.zeros(s.shape), world.gamma
     )
     targets = [soft(mdp, entropies[0]) for mdp in (world.target, world.source)]
-    exact = np.subtract(*(theory.expected_return(mdp, world.policy) for mdp in targets))
+    exact = np.subtract(*(tabular.expected_return(mdp, world.policy) for mdp in targets))
     assert abs(estimate.mean - exact) < 4 * estimate.standard_error
 
-    v, q, _ = theory.values(soft(world.source, entropies[1]), world.old_policy)
+    v, q, _ = tabular.values(soft(world.source, entropies[1]), world.old_policy)
     soft_q = q - alpha * entropies[1][:, None] - alpha * np.log(world.policy)
     s, a, _ = roll(np.random.default_rng(1), world.source, world.policy, 4000, steps=90)
-    estimate = theory.policy_gap_estimate(soft_q[s, a], v[s], world.gamma)
-    exact = theory.expected_return(targets[1], world.policy) - world.source.initial @ v
+    estimate = relativity_gap.policy_gap_estimate(soft_q[s, a], v[s], world.gamma)
+    exact = tabular.expected_return(targets[1], world.policy) - world.source.initial @ v
     assert abs(estimate.mean - exact) < 4 * estimate.standard_error
 
 
 def test_estimates_by_hand():
     one = [np.array([1.0, 2.0])]
-    estimate = theory.dynamics_gap_estimate(one, [np.array([4.0, 9.0])], [np.array([1.0, 1.0])], [[0, 1]], gamma=0.5)
+    estimate = relativity_gap.dynamics_gap_estimate(
+        one, [np.array([4.0, 9.0])], [np.array([1.0, 1.0])], [[0, 1]], gamma=0.5
+    )
     assert estimate[::2] == (1 + 0.5 * 4 - 1 + 0.5 * (2 - 1), 1)
     assert np.isnan(estimate.standard_error)
-    estimate = theory.policy_gap_estimate([[1.0], [3.0, 4.0]], [[0.0], [0.0, 0.0]], gamma=0.5)
+    estimate = relativity_gap.policy_gap_estimate([[1.0], [3.0, 4.0]], [[0.0], [0.0, 0.0]], gamma=0.5)
     assert estimate == (3.0, pytest.approx(2.0), 2)
 
 
 def test_estimators_name_what_is_wrong():
     with pytest.raises(ValueError, match="no episode"):
-        theory.policy_gap_estimate([], [], gamma=0.9)
+        relativity_gap.policy_gap_estimate([], [], gamma=0.9)
     with pytest.raises(ValueError, match="gamma"):
-        theory.policy_gap_estimate([[1.0]], [[1.0]], gamma=1.0)
+        relativity_gap.policy_gap_estimate([[1.0]], [[1.0]], gamma=1.0)
     with pytest.raises(ValueError, match="number of episodes"):
-        theory.policy_gap_estimate([[1.0]], [[1.0], [2.0]], gamma=0.9)
+        relativity_gap.policy_gap_estimate([[1.0]], [[1.0], [2.0]], gamma=0.9)
     with pytest.raises(ValueError, match="episode 0 needs"):
-        theory.policy_gap_estimate([[1.0]], [[1.0, 2.0]], gamma=0.9)
+        relativity_gap.policy_gap_estimate([[1.0]], [[1.0, 2.0]], gamma=0.9)
 
 
 @pytest.mark.parametrize("name", ["reward", "initial", "gamma"])
@@ -377,7 +385,7 @@ def test_worlds_that_differ_in_more_than_their_dynamics_are_refused(name):
     changed = {"reward": 2 * world.source.reward, "initial": world.source.initial[::-1], "gamma": 0.5}[name]
     other = replace(world.target, **{name: changed})
     with pytest.raises(ValueError, match=f"may differ in transition alone, but {name} differs"):
-        theory.relativity_gap(other, world.source, world.policy, world.old_policy)
+        tabular.relativity_gap(other, world.source, world.policy, world.old_policy)
     for which in ("target", "old_source"):
         with pytest.raises(ValueError, match=f"{name} differs"):
             replace(world, **{which: other})
@@ -386,4 +394,4 @@ def test_worlds_that_differ_in_more_than_their_dynamics_are_refused(name):
 def test_a_policy_that_is_no_distribution_is_refused():
     world = small_world()
     with pytest.raises(ValueError, match="policy must hold probabilities"):
-        theory.values(world.source, 2 * world.policy)
+        tabular.values(world.source, 2 * world.policy)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from benchmarks.tracing import encoder_sets, shape_sweep
-from benchmarks.tracing.encoder_sets import MACHINES, QUANTUM, SAMPLES, Job, recorded
+from benchmarks.runner import read_table
+from benchmarks.tracing import encoders, shapes
+from benchmarks.tracing.encoders import MACHINES, QUANTUM, SAMPLES, Job, recorded
 from sb3_rpto.effects import LIBRARY
 from sb3_rpto.sysid.findings import FindingKind
 
@@ -27,7 +27,7 @@ def report(verdict: str, *effects: tuple) -> SimpleNamespace:
 
 
 def test_there_are_twenty_complete_and_twenty_single_sets_of_each_machine_and_kind_of_samples() -> None:
-    sets = encoder_sets.jobs()
+    sets = encoders.jobs()
     assert len({*sets}) == len(sets) == 40
     assert sum(job.lacking for job in sets) == 20
     assert {(job.machine, job.samples) for job in sets} == {(m, s) for m in MACHINES for s in SAMPLES}
@@ -52,7 +52,7 @@ def test_what_is_named_too_much_is_counted() -> None:
         LIBRARY["coulomb_friction"]("hinge", level=0.1),
         LIBRARY["quadratic_drag"]("hinge", coefficient=0.2),
     )
-    judged = encoder_sets.judged
+    judged = encoders.judged
     assert judged(None, report("complete"))["right"]
     assert judged(None, report("explained", (drag, [[0], [1]], [])))["too_many"] == 1
     assert judged(friction, report("explained", (friction, [[0], [1]], [])))["right"]
@@ -67,27 +67,30 @@ def test_a_shape_is_right_by_name_and_value() -> None:
     near = planted.with_values(np.array([0.3, 1.9]))
     off = planted.with_values(np.array([0.3, 1.0]))
     narrow = [[0.29, 0.9], [0.31, 1.05]]
-    assert shape_sweep.judged(planted, report("explained", (near, narrow, [])))["right"]
-    assert not shape_sweep.judged(planted, report("explained", (off, narrow, [])))["right"]
-    assert shape_sweep.judged(planted, report("explained", (off, [[0.2, 0.5], [0.4, 2.5]], [])))["right"]
-    assert not shape_sweep.judged(planted, report("partly explained", (near, narrow, [])))["right"]
+    assert shapes.judged(planted, report("explained", (near, narrow, [])))["right"]
+    assert not shapes.judged(planted, report("explained", (off, narrow, [])))["right"]
+    assert shapes.judged(planted, report("explained", (off, [[0.2, 0.5], [0.4, 2.5]], [])))["right"]
+    assert not shapes.judged(planted, report("partly explained", (near, narrow, [])))["right"]
 
 
 def test_shapes_are_planted_over_their_range_on_two_machines() -> None:
-    sets = shape_sweep.jobs()
+    sets = shapes.jobs()
     assert len({*sets}) == len(sets) == 200
     for job in sets:
         effect = job.effect()
-        (shape,) = [v for p, v in zip(effect.parameters, effect.values) if p.name == shape_sweep.SHAPES[job.kind][0]]
+        (shape,) = [v for p, v in zip(effect.parameters, effect.values) if p.name == shapes.SHAPES[job.kind][0]]
         assert shape == job.shape
         assert all(p.lower <= v <= p.upper for p, v in zip(effect.parameters, effect.values))
 
 
-def test_a_finished_trace_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    job = Job("servo", "quantised", lacking=False)
-    monkeypatch.setattr(encoder_sets, "trace", lambda *_, **__: report("complete"))
-    row = encoder_sets.run(job, tmp_path)
-    monkeypatch.setattr(encoder_sets, "trace", lambda *_, **__: pytest.fail("it is there"))
-    assert encoder_sets.run(job, tmp_path) == row
-    with pytest.raises(pytest.fail.Exception):
-        encoder_sets.run(replace(job, seed=1), tmp_path)
+def test_a_study_of_traces_makes_one_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(encoders, "trace", lambda *_, **__: report("complete"))
+    out = ["--runs", str(tmp_path), "--workers", "1", "--only", "^servo_(quantised|jittered)_0$"]
+    assert encoders.main(out) == 0
+    rows = read_table(tmp_path / "table.csv")
+    assert [(row["samples"], row["verdict"], row["right"]) for row in rows] == [
+        ("quantised", "complete", True),
+        ("jittered", "complete", True),
+    ]
+    monkeypatch.setattr(encoders, "trace", lambda *_, **__: pytest.fail("it is there"))
+    assert encoders.main(out) == 0

@@ -1,28 +1,23 @@
-import csv
-import importlib
-import io
 import json
 import math
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
 import pytest
 
-from benchmarks import tracing
-from benchmarks.tracing import design, run, score, table
-from benchmarks.tracing.design import fingerprint
+from benchmarks.runner import read_table
+from benchmarks.tracing import run as tracing
+from benchmarks.tracing import table as tables
+from benchmarks.tracing.design import design, fingerprint
 from benchmarks.tracing.own import MACHINES, OWN, UNSEEN
 from benchmarks.tracing.planting import KINDS, SYSTEMS, draw, generate, places
-from benchmarks.tracing.score import share, wilson
-from benchmarks.tracing.table import cases_csv, manifest, summary_csv, write
+from benchmarks.tracing.score import score, share, wilson
+from benchmarks.tracing.table import table, write
 from benchmarks.tracing.truth import TWINS, as_effect, deviation, make
 from sb3_rpto.effects import LIBRARY, Drive, Effect, Simulation, declare
 from sb3_rpto.effects.corrected_model_io import correct
 
-# The package's attribute of that name is the function.
-runner = importlib.import_module("benchmarks.tracing.run")
 CASES = {case.id: case for case in design("full")}
 
 
@@ -457,24 +452,22 @@ def test_wilson_interval():
 # --- the table ------------------------------------------------------------------------------------------------------
 
 
-def test_tables(tmp_path):
+def test_tables(tmp_path, capsys):
     failed = {**result(error="Traceback\nValueError: no | way"), "effects": []}
     results = [result(named=[RIGHT]), result("complete-pendulum-1mrad", planted={}), failed]
     cases = [CASES[r["case"]["id"]] for r in results]
-    text = write(tmp_path, results, cases, "python -m benchmarks tracing --scale quick")
-    assert text == table(results) == (tmp_path / "table.md").read_text()
+    text = write(tmp_path / "t", results, cases, "python -m benchmarks tracing --scale quick")
+    assert text == table(results) == (tmp_path / "t.md").read_text()
     assert "| single effects, 1 mrad: right class | 90% | 1/2 = 50% [9%, 91%] | no |" in text
     assert "ValueError: no \\| way" in text
-    rows = list(csv.DictReader(io.StringIO(cases_csv(score(results)))))
-    assert [row["passed"] for row in rows] == ["1", "1", "0"]
-    assert rows[0]["named"] == "coulomb_friction(hinge)"
-    shares = list(csv.DictReader(io.StringIO(summary_csv(score(results)))))
-    (by_noise,) = [r for r in shares if (r["by"], r["measure"], r["group"]) == ("noise", "right class", "single")]
-    assert (by_noise["value"], by_noise["hits"], by_noise["n"]) == ("1 mrad", "1", "2")
-    found = json.loads((tmp_path / "manifest.json").read_text())
-    assert found == manifest(results, cases, found["command"])
+    found = json.loads((tmp_path / "t.json").read_text())
+    assert found["design"] == fingerprint(cases)
     assert (found["cases"], found["done"], found["errors"]) == (3, 3, 1)
     assert found["versions"]["mujoco"]
+    assert [row["case"] for row in read_table(tmp_path / "t.csv")] == [case.to_json() for case in cases]
+    (tmp_path / "t.md").unlink()
+    assert tables.main([str(tmp_path / "t.csv")]) == 0
+    assert capsys.readouterr().out == text + "\n", "the table tells all that the report does"
     assert table([]).startswith("# What the tracer finds")
 
 
@@ -493,56 +486,37 @@ def traced(monkeypatch):
         made = result(case.id, planted={}, ratio_before=math.nan)
         return {name: made[name] for name in made if name not in ("case", "version", "commit", "error")}
 
-    monkeypatch.setattr(runner, "examine", examine)
+    monkeypatch.setattr(tracing, "examine", examine)
     return seen
 
 
 def test_a_run_repeats_nothing_that_is_done(traced, tmp_path):
-    results = run(tmp_path, "quick", 1, only="^single")
-    ids = [case.id for case in design("quick") if case.group == "single"]
-    assert [r["case"]["id"] for r in results] == ids, "in the order of the design, though traced in a mixed one"
+    cases = [case for case in design("quick") if case.group == "single"]
+    results = tracing.run(tmp_path, cases, 1)
+    ids = [case.id for case in cases]
+    assert [r["name"] for r in results] == ids, "in the order of the design, though traced in a mixed one"
     assert sorted(traced) == sorted(ids)
     assert traced != ids
-    order = list(traced)
-    failed = [r for r in results if r["error"]]
-    assert ["quadratic_drag" in r["case"]["id"] for r in failed] == [True]
-    assert "no such thing" in failed[0]["error"]
-    assert results[0]["ratio_before"] is None, "strict JSON"
-    assert run(tmp_path, "quick", 1, only="^single") == results
-    assert traced == order, "also what failed stays"
-
-    folder = tmp_path / "cases"
-    (folder / f"{ids[0]}.json").write_text((folder / f"{ids[0]}.json").read_text()[:100])
-    other = json.loads((folder / f"{ids[1]}.json").read_text())
-    other["case"]["seed"] += 1
-    (folder / f"{ids[1]}.json").write_text(json.dumps(other))
-    (folder / f"{ids[2]}.json").unlink()
-    assert [r["case"] for r in run(tmp_path, "quick", 1, only="^single")] == [r["case"] for r in results]
-    assert traced[: len(ids)] == order
-    assert sorted(traced[len(ids) :]) == sorted(ids[:3])
-    run(tmp_path, "quick", 1, only="^single", resume=False)
-    assert len(traced) == 2 * len(ids) + 3
-    assert sorted(p.name for p in folder.iterdir()) == sorted(f"{id}.json" for id in ids), "no torn files"
-
-
-def test_several_workers(traced, tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "ProcessPoolExecutor", lambda n, mp_context: ThreadPoolExecutor(n))
-    results = run(tmp_path, "quick", 3)
-    assert sorted(traced) == sorted(case.id for case in design("quick")) == sorted(r["case"]["id"] for r in results)
-    assert [r["case"]["id"] for r in results] == [case.id for case in design("quick")]
+    (failed,) = (r for r in results if r["error"])
+    assert "quadratic_drag" in failed["name"]
+    assert "no such thing" in failed["error"]
+    assert results[0]["rows"][0]["ratio_before"] is None, "strict JSON"
+    traced.clear()
+    tracing.run(tmp_path, cases, 1)
+    assert traced == [failed["name"]]
 
 
 def test_a_part_that_is_traced_again_leaves_the_rest_in_the_table(traced, tmp_path, capsys):
-    common = ["--out", str(tmp_path), "--scale", "quick", "--workers", "1"]
-    assert tracing.main([*common, "--only", "^single"]) == 0
+    common = ["--runs", str(tmp_path), "--scale", "quick", "--workers", "1"]
+    assert tracing.main([*common, "--only", "^single"]) == 1, "one of them fails"
     singles = len(traced)
     assert tracing.main([*common, "--only", "^complete"]) == 0
-    assert f"{len(traced)} of {len(traced)} generated sets traced" in capsys.readouterr().out
-    assert len((tmp_path / "cases.csv").read_text().splitlines()) == 1 + len(traced) > 1 + singles
+    assert f"{len(traced) - 1} of {len(traced) - 1} generated sets traced" in capsys.readouterr().out
+    assert len(read_table(tmp_path / "table.csv")) == len(traced) - 1 > singles
 
 
 def test_command(traced, tmp_path, capsys):
-    arguments = ["--out", str(tmp_path), "--scale", "quick", "--workers", "1", "--only", "^complete-pendulum-1mrad$"]
+    arguments = ["--runs", str(tmp_path), "--scale", "quick", "--workers", "1", "--only", "^complete-pendulum-1mrad$"]
     assert tracing.main(arguments) == 0
     assert "1 of 1 generated sets traced" in capsys.readouterr().out
     assert tracing.main(arguments) == 0
@@ -550,25 +524,22 @@ def test_command(traced, tmp_path, capsys):
     assert tracing.main([*arguments, "--fresh"]) == 0
     assert len(traced) == 2
     capsys.readouterr()
-    assert json.loads((tmp_path / "manifest.json").read_text())["command"].startswith("python -m benchmarks tracing")
-    assert tracing.main([*arguments[2:], "--list"]) == 0
+    assert json.loads((tmp_path / "table.json").read_text())["command"].startswith("python -m benchmarks tracing")
+    assert tracing.main([*arguments, "--list"]) == 0
     assert capsys.readouterr().out == "complete-pendulum-1mrad\n"
-    with pytest.raises(SystemExit):
-        tracing.main(arguments[2:])
-    assert "--out DIR" in capsys.readouterr().err
     for bad, message in (
         (["--only", "["], "regular"),
-        (["--only", "nothing"], "no case"),
+        (["--only", "nothing"], "no run"),
         (["--workers", "0"], "workers"),
     ):
         with pytest.raises(ValueError, match=message):
-            tracing.main(["--out", str(tmp_path), *bad])
+            tracing.main(["--runs", str(tmp_path), *bad])
 
 
 @pytest.mark.slow
 def test_a_small_case_from_end_to_end():
     case = CASES["complete-pendulum-1mrad"]
-    found = runner.examine(case, episodes=8, duration=2.5)
+    found = tracing.examine(case, episodes=8, duration=2.5)
     row = only({"case": case.to_json(), "error": None, **found})
     assert row.passed
     assert row.verdict == "complete"
@@ -584,9 +555,9 @@ def test_the_true_structure_takes_the_error_away(monkeypatch):
     def few(*arguments, **settings):
         return full(*arguments, candidates=["coulomb_friction"], **settings)
 
-    full = runner.trace
-    monkeypatch.setattr(runner, "trace", few)
-    found = runner.examine(case, episodes=6, duration=1.5)
+    full = tracing.trace
+    monkeypatch.setattr(tracing, "trace", few)
+    found = tracing.examine(case, episodes=6, duration=1.5)
     errors = {name: e["hinge"] for name, e in found["errors"].items()}
     assert errors["true"] < 0.5 * errors["before"]
     assert errors["true"] < 1.5 * errors["floor"]

@@ -1,4 +1,4 @@
-"""Statistics against hand-computed numbers, and the report of a folder whose results are known."""
+"""Tables against hand-computed numbers, and the report of a folder whose results are known."""
 
 from __future__ import annotations
 
@@ -10,58 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.transfer import plan, tables
+from benchmarks.__main__ import main
+from benchmarks.transfer import plan, statistics, tables
 from benchmarks.transfer.plots import learning_curves
-from sb3_rpto import cli
-from sb3_rpto.evaluation import statistics
-
-# --- statistics -----------------------------------------------------------------------------------------------------
-
-
-def test_iqm_is_the_mean_of_the_middle_half() -> None:
-    assert statistics.iqm(np.array([100.0, 3.0, 4.0, -50.0, 5.0, 6.0, 2.0, 7.0])) == 4.5
-    assert statistics.iqm(np.array([1.0, 2.0, 30.0])) == 11.0  # of three seeds a quarter is less than one
-    assert statistics.iqm(np.array([0.0, 1.0, 2.0, 6.0, 99.0])) == 3.0
-
-
-def test_interval_of_two_seeds_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two runs a resample has the mean 0, 1/2 or 1 with probability 1/4, 1/2, 1/4."""
-    assert statistics.iqm_interval(np.array([0.0, 1.0])) == (0.5, 0.0, 1.0)
-    monkeypatch.setattr(statistics, "CONFIDENCE", 0.4)
-    assert statistics.iqm_interval(np.array([0.0, 1.0])) == (0.5, 0.5, 0.5)
-
-
-def test_strata_are_resampled_for_themselves() -> None:
-    """Runs that agree on each target leave nothing to resample, however far apart the targets are."""
-    assert statistics.stratified_interval([np.zeros(4), np.ones(4)]) == (0.5, 0.5, 0.5)
-    values = np.array([0.3, 0.1, 0.9, 0.4])
-    assert statistics.stratified_interval([values]) == statistics.iqm_interval(values)
-
-
-@pytest.mark.parametrize(
-    ("x", "y", "expected"),
-    [
-        ([1, 2, 3], [0, 2, 4], 4.5 / 9),  # 1; 1 and a tie; 2
-        ([5, 6], [1, 2, 3], 1.0),
-        ([1], [1, 1, 0, 2], 0.5),
-        ([0, 3], [1], 0.5),
-    ],
-)
-def test_probability_of_improvement_counts_pairs(x: list[float], y: list[float], expected: float) -> None:
-    value, low, high = statistics.improvement([(np.array(x), np.array(y))])
-    assert value == pytest.approx(expected)
-    assert 0 <= low <= value <= high <= 1
-    reverse, *_ = statistics.improvement([(np.array(y), np.array(x))])
-    assert reverse == pytest.approx(1 - expected)
-
-
-def test_probability_of_improvement_is_averaged_over_targets() -> None:
-    pairs = [(np.array([1.0]), np.array([0.0])), (np.array([1.0, 2.0, 3.0]), np.array([5.0, 2.5]))]
-    value, low, high = statistics.improvement(pairs)
-    assert value == pytest.approx((1 + 1 / 6) / 2)
-    assert 0.5 <= low <= value <= high <= 1
-    assert statistics.improvement([(np.array([0.0, 1.0]), np.array([0.5]))]) == (0.5, 0.0, 1.0)
-
 
 # --- a folder -------------------------------------------------------------------------------------------------------
 
@@ -88,7 +39,8 @@ def result(task: str, target: str, label: str, method: str, seed: int, returns: 
     ]
     if method == "rpto":
         rows = [{**row, "model_error": 0.1 * (1 + seed) + row["steps"]} for row in rows]
-    made = {"name": f"{task}_{target}_{label}_{seed}", "job": {**job, "factors": {}}, "commit": "c0ffee", "error": None}
+    made = {"name": f"{task}_{target}_{label}_{seed}", "job": {**job, "factors": {}}, "commit": "c0ffee"}
+    made |= {"versions": {}, "python": "3", "machine": "any"}
     return {**made, "source": {"sha256": "abc"}, "seconds": 9.0, "rows": rows}
 
 
@@ -181,20 +133,23 @@ def test_first_on_how_many_targets(folder: Path) -> None:
 
 
 def test_everything_is_written_beside_the_manifest(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["benchmark", "report", str(folder)]) == 0
-    text = (folder / "report.md").read_text()
+    assert main(["transfer", "report", str(folder)]) == 0
+    text = (folder / "table.md").read_text()
     assert capsys.readouterr().out.strip() == text.strip()
     assert "8 of 10 runs are done" in text
     assert "| sac-warm | 2 |" in text
     assert "> 20 (1/2)" in text
     assert "First: at 10 rpto-x, sac-warm; at 20 sac-warm." in text
     assert "never-run" not in text
-    for name in ("curves", "overall", "costs", "improvement", "first"):
-        assert len(pd.read_csv(folder / f"{name}.csv"))
-    found = json.loads((folder / "report.json").read_text(), parse_constant=pytest.fail)
+    found = json.loads((folder / "table.json").read_text(), parse_constant=pytest.fail)
     assert found["commits"] == ["c0ffee"]
-    assert (found["runs"], len(found["overall"])) == (8, 3 * 3)
-    assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "table.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_table_reports_what_its_folder_reports(folder: Path, tmp_path: Path) -> None:
+    text = tables.write(folder, tmp_path / "quick")
+    assert tables.write(tmp_path / "quick.csv") == text
+    assert tables.load(tmp_path / "quick.csv").results == tables.load(folder).results
 
 
 def test_the_figure_shows_the_table(folder: Path) -> None:
@@ -277,13 +232,12 @@ def test_a_factorial_suite_reports_its_factors(folder: Path) -> None:
     text = tables.write(folder)
     assert text.index("| 5 | ") < text.index("| 20 | "), "levels in order, numbers by their size"
     assert "| kind | runs | score, Ant | score, Hopper | score, all |" in text
-    assert len(pd.read_csv(folder / "effects.csv"))
 
 
 def test_no_results_are_bad_input(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for file in (folder / "runs").glob("*.json"):
         file.unlink()
-    assert cli.main(["benchmark", "report", str(folder)]) == 2
+    assert main(["transfer", "report", str(folder)]) == 2
     assert "no run is done" in capsys.readouterr().err
-    assert cli.main(["benchmark", "report", str(folder / "absent")]) == 2
-    assert "benchmark transfer" in capsys.readouterr().err
+    assert main(["transfer", "report", str(folder / "absent")]) == 2
+    assert "benchmarks transfer" in capsys.readouterr().err
