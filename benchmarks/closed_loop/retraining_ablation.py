@@ -28,7 +28,7 @@ from tqdm import tqdm
 from benchmarks import RESULTS
 from benchmarks.closed_loop.study import TASKS, make_source, make_target, source_agent
 from sb3_rpto import RPTO
-from sb3_rpto.algorithms.closed_loop.controller import LoopCloser
+from sb3_rpto.algorithms.closed_loop.controller import ClosedLoop
 from sb3_rpto.evaluation.learning_curve import EVALUATION_SEED
 
 TASK, SHIFT, SEEDS = "double-pendulum", "none", range(3)
@@ -42,7 +42,7 @@ def run(job: tuple[bool, int]) -> list[dict[str, Any]]:
     th.set_num_threads(1)
     agent, _ = source_agent(TASK, RUNS)
     target = make_vec_env(partial(make_target, TASK, SHIFT, 0), n_envs=20)
-    judged = nullcontext() if rehearsed else mock.patch.object(LoopCloser, "may_judge", return_value=False)
+    judged = nullcontext() if rehearsed else mock.patch.object(ClosedLoop, "can_evaluate_policies", return_value=False)
     with judged:
         model = RPTO.from_source(
             *(agent, make_source(TASK), make_target(TASK, SHIFT, 0)),
