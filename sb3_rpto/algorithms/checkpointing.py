@@ -53,7 +53,7 @@ class ResumePoint:
     :param unstored_step: a target step that was taken and not stored yet
     :param knows_source: whether the policy does
     :param learner: the policy that goes on learning while the best one acts
-    :param seed: given since the model was loaded
+    :param seed: given to a loaded model, which has not learned since
     :param normalised: whether the policy saw normalised observations; None before it is known
     :param target_size: capacity of the buffer's target side, where the user chose one
     """
@@ -85,13 +85,13 @@ def capture(agent: TwoEnvAgent) -> ResumePoint:
         "algorithm": algorithm_of(type(agent)),
         "knows_source": agent.state.knows_source,
         "learner": agent.snapshots.get("learner"),
-        "seed": agent.new_seed,
         "target_size": (agent.replay_buffer_kwargs or {}).get("target_size"),
     }
     if agent.env is not None:
         since["normalised"] = normalises(normaliser)
     if loaded is not None:
-        return replace(loaded, **since)
+        return replace(loaded, seed=agent.new_seed, **since)
+    last_obs, last_original_obs = agent.last_target_observation()
     return ResumePoint(
         streams={
             "random": random.getstate(),
@@ -104,7 +104,8 @@ def capture(agent: TwoEnvAgent) -> ResumePoint:
         statistics={} if normaliser is None else save_statistics(normaliser),
         target=save_state(agent.target.raw) if isinstance(agent.target, OnlineTarget) else None,
         rollouts=None if agent.rollouts is None else agent.rollouts.get_state(),
-        **agent.last_target_observation(),
+        last_obs=last_obs,
+        last_original_obs=last_original_obs,
         unstored_step=agent.unstored_step(),
         **since,
     )
@@ -224,7 +225,7 @@ def _put_target_back(agent: TwoEnvAgent, target: OnlineTarget, point: ResumePoin
     if point.unstored_step is not None:
         _store_unstored_step(agent, target, point.unstored_step)
     if not restored:
-        agent.begin_at(**begun)
+        agent.begin_at(*begun)
         if normaliser is not None:
             vars(normaliser).update(raw)
     return restored

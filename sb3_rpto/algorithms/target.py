@@ -58,7 +58,7 @@ class OnlineTarget(Target):
         """
         coming = min(agent.state.rollout_timesteps, agent.steps_left())
         if agent.train_freq.unit == TrainFrequencyUnit.STEP:
-            coming = agent.rollout_length().frequency * self.n_envs
+            coming = agent.target_rollout_length().frequency * self.n_envs
         return agent.state.source_steps_due + coming * agent.source_steps_per_target_step()
 
     def collect(self, agent: Agent, callback: BaseCallback, log_interval: int | None) -> bool:

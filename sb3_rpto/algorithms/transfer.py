@@ -214,7 +214,7 @@ class TransferAlgorithm(TwoEnvSAC):
             device,
         )
         self.preset = preset
-        self.dynamics_backend = dynamics
+        self.dynamics_backend: str = dynamics
         self.dynamics_kwargs = arguments.plain_effects(dynamics_kwargs or {})
         #: gradient steps of any fit of the dynamics at most, where the user passed a number
         self.fit_bound: int | None = self.dynamics_kwargs.get("max_steps")

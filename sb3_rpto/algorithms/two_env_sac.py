@@ -70,7 +70,7 @@ class TwoEnvSAC(SAC):
     _last_original_obs: np.ndarray | None
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs, _init_setup_model=False)
+        super().__init__(*args, **{**kwargs, "_init_setup_model": False})
         self.state = RunState()
         #: policies to go back to, by name
         self.snapshots = PolicySnapshots()
@@ -197,7 +197,7 @@ class TwoEnvSAC(SAC):
         if online is not None:
             self.check_pair(source, online.raw)
         before, after, last_obs = self.get_vec_normalize_env(), unwrap_vec_normalize(source), self._last_obs
-        had = normalises(before)
+        had: bool | None = normalises(before)
         if self.env is None:
             had = None if self.resume_point is None else self.resume_point.normalised
         if had is not None and (self.num_timesteps or self.state.pretraining_timesteps):
@@ -304,7 +304,7 @@ class TwoEnvSAC(SAC):
 
     # ------------------------------------------------------------------ steps in the target
 
-    def rollout_length(self) -> TrainFreq:
+    def target_rollout_length(self) -> TrainFreq:
         """``train_freq``, cut off where the budget ends."""
         assert self.target_env is not None
         steps_left = self.steps_left() // self.target_env.num_envs
@@ -315,7 +315,7 @@ class TwoEnvSAC(SAC):
     def collect_in_target(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Take a rollout in the target by SB3's own code, within the budget; whether to go on."""
         assert isinstance(self.target, OnlineTarget)
-        length = self.rollout_length()
+        length = self.target_rollout_length()
         allowance = length.frequency * self.target.n_envs
         self.state.rollout_start = self.num_timesteps
         with self._normalised_as_target(self.target), self.target.ledger.spending("learning", allowance):
@@ -431,9 +431,9 @@ class TwoEnvSAC(SAC):
 
     # ------------------------------------------------------------------ files
 
-    def last_target_observation(self) -> dict[str, np.ndarray | None]:
+    def last_target_observation(self) -> tuple[np.ndarray | None, np.ndarray | None]:
         """The target's last observation as the policy sees it, and the same as it was before a VecNormalize."""
-        return {"last_obs": self._last_obs, "last_original_obs": self._last_original_obs}
+        return self._last_obs, self._last_original_obs
 
     def begin_at(self, last_obs: np.ndarray | None, last_original_obs: np.ndarray | None) -> None:
         """Go on in the target from an observation of :meth:`last_target_observation`."""

@@ -198,17 +198,17 @@ def test_a_step_of_the_target_that_was_interrupted_is_no_somebody_elses():
 
 def stop_at(model, steps):
     """Ctrl-C in the update after so many target steps, each of which is stored by then."""
-    update = model.update
+    update = model.update_policy
 
     def interrupted():
         if model.num_timesteps == steps:
             raise KeyboardInterrupt
         update()
 
-    model.update = interrupted
+    model.update_policy = interrupted
     with pytest.raises(KeyboardInterrupt):
         model.learn(100, source_timesteps=0)
-    del model.update
+    del model.update_policy
 
 
 @pytest.mark.parametrize("other", [False, True])
