@@ -3,7 +3,7 @@
 python -m benchmarks closed_loop retraining     # half an hour on two cores
 
 The policy balances already, and D_source begins with what it sees while it does. Counted are the episodes of 40 in
-which it falls after it has learned on, with rehearsals in the simulator (algorithms/rehearsals.py) and without.
+which it falls after it has learned on, with policies evaluated in the simulator before they act, and without.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def run(job: tuple[bool, int]) -> list[dict[str, Any]]:
                 {
                     **{"rehearsals": rehearsed, "seed": seed, "steps": steps, "return": np.mean(returns)},
                     **{"falls": int(np.sum(np.less(lengths, WHOLE))), "episodes": EPISODES},
-                    **{"updates": model._n_updates, "source_steps": model.source_timesteps},
+                    **{"updates": model.n_updates, "source_steps": model.source_timesteps},
                 }
             )
     return rows

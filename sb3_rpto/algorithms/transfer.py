@@ -104,9 +104,6 @@ class TransferAlgorithm(TwoEnvSAC):
     #: whether step 6 of Algorithm 1 applies RPO, and whether it applies RTO
     updates_policy: ClassVar[bool]
     updates_dynamics: ClassVar[bool]
-    #: arguments that other algorithms have and this one does not use
-    unused: ClassVar[frozenset[str]] = frozenset()
-
     #: names of the arguments that the user passed
     given_arguments: frozenset[str]
     target_entropy: float  # SAC's setup has replaced "auto"
@@ -289,17 +286,6 @@ class TransferAlgorithm(TwoEnvSAC):
 
         :raises ValueError: naming the argument and its value
         """
-
-    @classmethod
-    def refuse_unused(cls, given: Iterable[str]) -> None:
-        """Refuse arguments in :attr:`unused`.
-
-        :param given: names of the arguments
-        :raises ValueError: naming those
-        """
-        unused = sorted(cls.unused.intersection(given))
-        if unused:
-            raise ValueError(f"{cls.__name__} does not use {unused}; leave them out or use RPTO")
 
     def _setup_model(self) -> None:
         """Build networks, buffers and dynamics from the spaces alone: ``load()`` has no environment."""
@@ -848,21 +834,6 @@ class TransferAlgorithm(TwoEnvSAC):
             super().save(path, exclude, include)
         finally:
             self.dynamics_config = kept
-
-    @classmethod
-    def load(cls: type[Self], path: Any, env: GymEnv | str | None = None, *args: Any, **kwargs: Any) -> Self:
-        """Load a checkpoint; without environments the model can predict, with them it resumes.
-
-        :param path: of the zip
-        :param env: the source, or its id
-        :param args: as SB3's ``load``
-        :param kwargs: as SB3's ``load``, and ``target_env``, the target or its id
-        :raises ValueError: for a file that is no zip of this algorithm's, or a damaged one, a target that is not passed
-            by name, and arguments that a saved model does not change
-        :raises TypeError: for what is no path, or no environment
-        """
-        cls.refuse_unused(kwargs)
-        return super().load(path, env, *args, **kwargs)
 
     def _finish_loading(self, seed: int | None) -> None:
         arguments.check_values_of(self)

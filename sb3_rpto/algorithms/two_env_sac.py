@@ -9,7 +9,7 @@ import pathlib
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
@@ -60,6 +60,9 @@ class TwoEnvSAC(SAC):
     :param args: SAC's
     :param kwargs: SAC's
     """
+
+    #: arguments that other algorithms have and this one does not use
+    unused: ClassVar[frozenset[str]] = frozenset()
 
     observation_space: spaces.Box  # check_spaces refuses any other
     action_space: spaces.Box
@@ -522,6 +525,7 @@ class TwoEnvSAC(SAC):
             by name, and arguments that a saved model does not change
         :raises TypeError: for what is no path, or no environment
         """
+        cls.refuse_unused(kwargs)
         known = constructor_names(cls) | set(inspect.signature(SAC.load).parameters)
         file = checkpointing.check_load(cls.__name__, path, args, kwargs, known)
         env = gym.make(env) if isinstance(env, str) else env
@@ -535,6 +539,17 @@ class TwoEnvSAC(SAC):
         if target_env is not None:
             model.set_target_env(target_env)
         return model
+
+    @classmethod
+    def refuse_unused(cls, given: Iterable[str]) -> None:
+        """Refuse arguments in :attr:`unused`.
+
+        :param given: names of the arguments
+        :raises ValueError: naming those
+        """
+        unused = sorted(cls.unused.intersection(given))
+        if unused:
+            raise ValueError(f"{cls.__name__} does not use {unused}; leave them out or use RPTO")
 
     def _finish_loading(self, seed: int | None) -> None:
         """What SB3's ``load()`` has changed, as the checkpoint has it.
