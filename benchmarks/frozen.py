@@ -39,7 +39,10 @@ RUNS: dict[str, tuple[type[TransferAlgorithm], dict[str, Any]]] = {
     "RTO, physical": (RTO, PHYSICAL),
     "RPTO, physical": (RPTO, PHYSICAL),
     "RPTO, residual": (RPTO, {**PHYSICAL, "dynamics": "residual"}),
-    "RPTO, closed loop": (RPTO, {**PHYSICAL, "close_loop": ["coulomb_friction"], "retrain_steps": 1_000}),
+    "RPTO, closed loop": (
+        RPTO,
+        {**PHYSICAL, "close_loop": True, "effects": ["coulomb_friction"], "retrain_steps": 1_000},
+    ),
 }
 
 

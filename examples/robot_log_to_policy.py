@@ -131,7 +131,8 @@ def by_rpto(source: Path, data: Measurements, kinds: list[str] | None, steps: in
         target_data=data,
         dynamics="physical",
         declared=DECLARED,
-        close_loop=kinds or True,
+        close_loop=True,
+        effects=kinds or "all",
         seed=seed,
         device="cpu",
     )

@@ -25,7 +25,7 @@ from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewar
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto import RPTO
-from sb3_rpto.algorithms.update import as_transitions
+from sb3_rpto.algorithms.recorded_data import as_transitions
 from sb3_rpto.baselines.sac_variants import fine_tuned_sac
 from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.base import Transitions

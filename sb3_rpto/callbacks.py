@@ -13,9 +13,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
+from sb3_rpto.algorithms.recorded_data import as_transitions
 from sb3_rpto.algorithms.rollouts import EpisodeSource
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
-from sb3_rpto.algorithms.update import as_transitions
 from sb3_rpto.buffers import rows_in_order
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.evaluation.relativity_gap import Estimate, dynamics_gap_estimate, policy_gap_estimate
@@ -108,7 +108,7 @@ class RelativityGapCallback(TransferCallback):
         episodes = newest_episodes(side, self.model.target_env.num_envs, self.n_episodes)
         if not episodes:
             return None
-        data = self.model._with_critic_rewards(self._transitions(side, np.concatenate(episodes)))
+        data = self.model.with_critic_rewards(self._transitions(side, np.concatenate(episodes)))
         return dynamics_gap_estimate(
             _split(data.rewards, episodes),
             _split(self.model.soft_value(data.next_observations), episodes),
@@ -122,7 +122,7 @@ class RelativityGapCallback(TransferCallback):
 
         ``n_episodes`` of the answer counts states where the source is rolled out in branches.
         """
-        side, world, gamma = self.model.replay_buffer.source, self.model._source_world, self.model.gamma
+        side, world, gamma = self.model.replay_buffer.source, self.model.rollouts, self.model.gamma
         if isinstance(world, EpisodeSource):
             episodes = newest_episodes(side, world.env.num_envs, self.n_episodes)
             if not episodes:
@@ -146,7 +146,7 @@ class RelativityGapCallback(TransferCallback):
         :param observations: (n, observation_dim), raw
         :return: two tensors (n,)
         """
-        seen = self.model._normalised(th.as_tensor(observations, device=self.model.device))
+        seen = self.model.normalise_observations(th.as_tensor(observations, device=self.model.device))
         old, temperature = self._old_policy()
         values = []
         for policy in (self.model.policy, old):
@@ -207,7 +207,7 @@ class KeepBest(TransferCallback):
 
     def _init_callback(self) -> None:
         super()._init_callback()
-        self.model.best_by = "evaluation"
+        self.model.snapshots.best_by = "evaluation"
 
     def _on_step(self) -> bool:
         assert isinstance(self.parent, EvalCallback)

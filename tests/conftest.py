@@ -17,7 +17,7 @@ from hypothesis import settings
 
 from benchmarks.tracing.planting import Planted, generate
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms import warm_start
+from sb3_rpto.algorithms import pretraining
 from sb3_rpto.effects import declare
 from sb3_rpto.envs.corrected import apply_effects
 from sb3_rpto.sysid import Report, trace
@@ -49,9 +49,9 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture(autouse=True)
 def _short_source_phase(monkeypatch):
     """The collection for phi_0 takes 25,000 source steps; tests are served by fewer."""
-    monkeypatch.setattr(warm_start, "PHI_0_STEPS", PHI_0_STEPS)
-    monkeypatch.setattr(warm_start, "PHI_0_UPDATES", 30)
-    monkeypatch.setattr(warm_start, "FIRST_SOURCE_STEPS", PHI_0_STEPS)
+    monkeypatch.setattr(pretraining, "PHI_0_STEPS", PHI_0_STEPS)
+    monkeypatch.setattr(pretraining, "PHI_0_UPDATES", 30)
+    monkeypatch.setattr(pretraining, "FIRST_SOURCE_STEPS", PHI_0_STEPS)
 
 
 def pendulum(g: float = 10.0) -> gym.Env:

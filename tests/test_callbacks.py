@@ -402,7 +402,7 @@ def test_evaluations_decide_which_policy_is_kept():
     scripted = Scripted([-1e6, -9e5, -2e6, -1e6], callback_on_new_best=KeepBest())
     model.learn(80, scripted, source_timesteps=0)
     # every training return is far above these: had they counted, no evaluation would have been kept
-    assert model.best_mean_reward == -9e5
+    assert model.snapshots.best_mean_reward == -9e5
     assert same_policy(model.snapshots["best"]["policy"], scripted.policies[1])
     model.rollback("best")
     assert same_policy(model.policy.state_dict(), scripted.policies[1])
@@ -414,15 +414,15 @@ def test_a_real_evaluation_callback_keeps_its_best():
         DummyVecEnv([short_pendulum]), callback_on_new_best=KeepBest(), eval_freq=10, n_eval_episodes=1, warn=False
     )
     model.learn(30, evaluation, source_timesteps=0)
-    assert model.best_mean_reward == evaluation.best_mean_reward > -np.inf
+    assert model.snapshots.best_mean_reward == evaluation.best_mean_reward > -np.inf
     assert "best" in model.snapshots
 
 
 def test_training_returns_decide_without_the_callback():
     model = small(RPO, target=short_pendulum())
     model.learn(60, source_timesteps=0)
-    assert model.best_by == "training"
-    assert model.best_mean_reward > -1e5
+    assert model.snapshots.best_by == "training"
+    assert model.snapshots.best_mean_reward > -1e5
 
 
 @pytest.mark.slow
@@ -430,16 +430,16 @@ def test_training_and_evaluation_are_never_compared(tmp_path):
     model = small(RPO, target=short_pendulum())
     model.learn(40, source_timesteps=0)
     model.learn(20, Scripted([-1e6], callback_on_new_best=KeepBest()), source_timesteps=0)
-    assert (model.best_by, model.best_mean_reward) == ("evaluation", -1e6)
+    assert (model.snapshots.best_by, model.snapshots.best_mean_reward) == ("evaluation", -1e6)
     # a resumed run goes on with the score of its evaluations
     model.save(tmp_path / "model.zip")
     loaded = RPO.load(tmp_path / "model.zip", env=pendulum(), target_env=short_pendulum(), device="cpu")
     loaded.learn(20, Scripted([-2e6], callback_on_new_best=KeepBest()), source_timesteps=0)
-    assert loaded.best_mean_reward == -1e6
+    assert loaded.snapshots.best_mean_reward == -1e6
     # without an evaluation the training returns decide again, on their own scale
     loaded.learn(40, source_timesteps=0)
-    assert loaded.best_by == "training"
-    assert loaded.best_mean_reward > -1e5
+    assert loaded.snapshots.best_by == "training"
+    assert loaded.snapshots.best_mean_reward > -1e5
 
 
 def test_keep_best_belongs_into_an_evaluation():
@@ -451,5 +451,5 @@ def test_keep_best_belongs_into_an_evaluation():
 def test_keep_best_may_be_one_of_several_in_an_evaluation():
     both = CallbackList([KeepBest(), StopTrainingOnRewardThreshold(0.0)])
     model = small(RPO).learn(30, EvalCallback(pendulum(12.0), both, eval_freq=10, verbose=0), source_timesteps=0)
-    assert model.best_by == "evaluation"
-    assert model.best_mean_reward > -1e5
+    assert model.snapshots.best_by == "evaluation"
+    assert model.snapshots.best_mean_reward > -1e5

@@ -5,6 +5,7 @@ written with an underscore (20_000) there and are run as ``BUDGET`` steps.
 """
 
 import re
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_rpto import RPTO
-from sb3_rpto.algorithms.closed_loop import controller, source_buffer
+from sb3_rpto.algorithms.closed_loop.controller import ClosedLoop
 from sb3_rpto.callbacks import RelativityGapCallback
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics
 from sb3_rpto.effects import LIBRARY, Parameter, declare, parameter_names
@@ -125,13 +126,13 @@ def test_every_logged_key_is_explained_and_every_explained_key_is_logged(monkeyp
     physical = {"dynamics": "physical", "declared": ["pole_length", "gravity"], "policy_kwargs": SMALL_POLICY}
     model = RPTO("MlpPolicy", cartpole, target_env=gym.make(cartpole, pole_length=2.0), gradient_steps=1, **physical)
     keys |= logged(model)
-    monkeypatch.setattr(controller, "FIRST", 80)
-    monkeypatch.setattr(source_buffer, "FILL", 25)
+    monkeypatch.setattr(ClosedLoop, "settings", replace(ClosedLoop.settings, first_trace=80, fill_steps=25))
     double = "InvertedDoublePendulum-v5"
     target = apply_effects(gym.make(double), [LIBRARY["coulomb_friction"]("slider", level=5.0)])
     settings = {
         "declared": ["pole.length"],
-        "close_loop": ["coulomb_friction"],
+        "close_loop": True,
+        "effects": ["coulomb_friction"],
         "model_train_freq": 40,
         "retrain_steps": 25,
     }

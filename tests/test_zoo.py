@@ -201,7 +201,7 @@ def test_training_is_judged_on_the_target(trained):
     assert model.target_spent == {"learning": 40}
     assert model.preset == "default"
     assert model.real_ratio == resolve_preset("default", "real", SOURCE, ())["real_ratio"]
-    assert model._pretrained_steps == 120
+    assert model.state.pretraining_timesteps == 120
     with np.load(trained / "evaluations.npz") as evaluations:
         assert evaluations["timesteps"].tolist() == [20, 40]
     header = (trained / "0.monitor.csv").read_text().splitlines()[0]
@@ -281,7 +281,7 @@ def test_a_source_agent_brings_its_settings_along(zoo, agent, tmp_path):
     physical = ["dynamics:'physical'", "declared:['pole_length']"]
     run = launch(tmp_path, "rpto", *source, *SMALL, *physical, "batch_size:16")
     model = RPTO.load(final(run), device="cpu")
-    assert (model.gamma, model.batch_size, model._pretrained_steps) == (0.97, 16, 0)
+    assert (model.gamma, model.batch_size, model.state.pretraining_timesteps) == (0.97, 16, 0)
     assert model.policy_kwargs["net_arch"] == [16]
     saved = (run / final(run).stem / "args.yml").read_text()
     assert str(agent) in saved
@@ -321,7 +321,7 @@ def test_a_normalised_agent_is_played_as_it_was_trained(zoo, tmp_path, monkeypat
 def test_ctrl_c_in_the_source_phase_saves_also_with_a_progress_bar_and_workers_that_it_ended(
     zoo, tmp_path, monkeypatch
 ):
-    begin = RPO.begin_in_source
+    begin = RPO.prepare_in_source
 
     def gone(world):
         raise ConnectionResetError
@@ -331,9 +331,9 @@ def test_ctrl_c_in_the_source_phase_saves_also_with_a_progress_bar_and_workers_t
         monkeypatch.setattr(type(model.env.unwrapped), "close", gone)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(RPO, "begin_in_source", interrupted)
+    monkeypatch.setattr(RPO, "prepare_in_source", interrupted)
     run = launch(tmp_path, "rpo", "-P", "-n", "4", "--source-timesteps", "120", "--eval-freq", "-1", *COLD)
-    assert RPO.load(final(run), device="cpu")._pretrained_steps == 120
+    assert RPO.load(final(run), device="cpu").state.pretraining_timesteps == 120
 
 
 def test_what_a_search_draws_joins_the_settings():

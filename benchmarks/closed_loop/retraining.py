@@ -22,7 +22,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from benchmarks.closed_loop.study import TASKS, make_source, make_target, source_agent
 from benchmarks.runner import Row, Study
 from sb3_rpto import RPTO
-from sb3_rpto.algorithms.closed_loop.controller import LoopCloser
+from sb3_rpto.algorithms.closed_loop.controller import ClosedLoop
 from sb3_rpto.evaluation.learning_curve import EVALUATION_SEED
 
 TASK, SHIFT, SEEDS = "double-pendulum", "none", range(3)
@@ -45,7 +45,9 @@ def run(job: Job, folder: Path) -> list[Row]:
     """
     agent, _ = source_agent(TASK, folder)
     target = make_vec_env(partial(make_target, TASK, SHIFT, 0), n_envs=20)
-    judged = nullcontext() if job.rehearsals else mock.patch.object(LoopCloser, "may_judge", return_value=False)
+    judged = (
+        nullcontext() if job.rehearsals else mock.patch.object(ClosedLoop, "can_evaluate_policies", return_value=False)
+    )
     with judged:
         model = RPTO.from_source(
             *(agent, make_source(TASK), make_target(TASK, SHIFT, 0)),
@@ -63,7 +65,7 @@ def run(job: Job, folder: Path) -> list[Row]:
                 model, target, n_eval_episodes=EPISODES, deterministic=True, return_episode_rewards=True, warn=False
             )
             row = {"steps": steps, "return": np.mean(returns), "falls": int(np.sum(np.less(lengths, WHOLE)))}
-            spent = {"updates": model._n_updates, "source_steps": model.source_timesteps}
+            spent = {"updates": model.n_updates, "source_steps": model.source_timesteps}
             rows.append({**row, "episodes": EPISODES, **spent})
     return rows
 

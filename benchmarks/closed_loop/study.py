@@ -94,7 +94,7 @@ METHODS: dict[str, tuple[str, tuple[int, ...], dict[str, Any]]] = {
     "RPTO-ensemble": ("rpto", SHORT, {"dynamics": "ensemble"}),
     "RPTO-physical, open loop": ("rpto", SHORT, PHYSICAL),
     # The closed loop without its library: what learning on in a fitted, incomplete simulator is worth.
-    "RPTO-physical, declared alone": ("rpto", SHORT, {**PHYSICAL, "close_loop": []}),
+    "RPTO-physical, declared alone": ("rpto", SHORT, {**PHYSICAL, "close_loop": True, "effects": []}),
     "RPTO-physical, closed loop": ("rpto", SHORT, {**PHYSICAL, "close_loop": True}),
     # Told of no number that may differ: the trace has to find these, too.
     "RPTO-physical, nothing declared": ("rpto", SHORT, {**PHYSICAL, "close_loop": True, "declared": []}),
@@ -322,7 +322,7 @@ def _read(task: str, truth: dict[str, float], model: Any) -> dict[str, Any]:
     off = [abs(known[name] / value - 1) for name, value in truth.items() if name in known]
     if off:
         row["parameter_error"] = float(np.median(off))
-    if model.loop is not None and model.loop.found:
+    if model.loop.found:
         last = model.loop.found[-1]
         row["verdict"] = last["verdict"]
         declared = {e.label for e in dynamics.effects() if isinstance(e, Declared)}

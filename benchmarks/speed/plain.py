@@ -117,7 +117,7 @@ class PlainEnsemble(EnsembleDynamics):
 class PlainRPTO(RPTO):
     """RPTO with the update as SB3 writes it, drawing each batch when it is needed, and the plain ensemble."""
 
-    def _make_dynamics(self, config: dict[str, Any]) -> Dynamics:
+    def make_dynamics(self, config: dict[str, Any]) -> Dynamics:
         arguments = {name: value for name, value in config.items() if name != "backend"}
         return PlainEnsemble(self.observation_space, self.action_space, **arguments)
 

@@ -39,11 +39,13 @@ from benchmarks.closed_loop.study import (
     source_agent,
 )
 from benchmarks.runner import Row, Study
-from sb3_rpto.algorithms.closed_loop.controller import FIRST, horizon_of
+from sb3_rpto.algorithms.closed_loop.controller import ClosedLoop, horizon_of
 from sb3_rpto.effects import LIBRARY, Declared, Effect
 from sb3_rpto.sysid import Measurements, Report, trace
 from sb3_rpto.sysid.data.columns import columns_of
 
+#: Target transitions before a closed loop's first trace.
+FIRST = ClosedLoop.settings.first_trace
 #: A noisy log: runs, steps of the policy in each, and the longest time between two samples in s.
 RUNS, STEPS, SAMPLED = 10, 100, 0.01
 #: A shift of the declared numbers, and a cause outside of the library: gusts of so many N on the first coordinate,

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 
 from benchmarks.provenance import commit, versions
-from sb3_rpto.algorithms import warm_start
+from sb3_rpto.algorithms import pretraining
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.files import json_text, write_atomically
 
@@ -36,7 +36,7 @@ def fit_once(model: TransferAlgorithm, folder: Path) -> None:
     settings = [
         json_text(model.dynamics_config),
         str(model.device),
-        warm_start.phi_0_updates(model),
+        pretraining.phi_0_updates(model),
         versions(),
         made_by,
     ]
@@ -46,7 +46,7 @@ def fit_once(model: TransferAlgorithm, folder: Path) -> None:
         dynamics.load_state_dict(kept["model"])
         dynamics.optimizer.load_state_dict(kept["optimizer"])
         return
-    dynamics.fit(data, max_steps=warm_start.phi_0_updates(model))
+    dynamics.fit(data, max_steps=pretraining.phi_0_updates(model))
     state = {"model": dynamics.state_dict(), "optimizer": dynamics.optimizer.state_dict()}
     write_atomically(path, lambda file: th.save(state, file), "pt")
 

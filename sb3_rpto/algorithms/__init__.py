@@ -1,7 +1,5 @@
 """RPO, RTO and RPTO."""
 
-from sb3_rpto.algorithms.rpo import RPO
-from sb3_rpto.algorithms.rpto import RPTO
-from sb3_rpto.algorithms.rto import RTO
+from sb3_rpto.algorithms.rpto import RPO, RPTO, RTO
 
 __all__ = ["RPO", "RPTO", "RTO"]

@@ -117,6 +117,7 @@ GIVEN = {
     "source_steps": whole(1) | one_of(("auto",)),
     "preset": one_of(preset_names()),
     "dynamics_kwargs": MAPPING | NONE,
+    "close_loop": Rule("be True or False (which effects to look for is effects=)", lambda x: isinstance(x, bool)),
 }
 #: Of ``learn()``.
 OF_LEARN = {

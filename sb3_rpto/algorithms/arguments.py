@@ -5,23 +5,29 @@ from __future__ import annotations
 import inspect
 import math
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
+import cloudpickle
+from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_rpto.algorithms import argument_ranges
-from sb3_rpto.algorithms.two_env_sac import TwoWorlds
-from sb3_rpto.effects import Declared, Effect
+from sb3_rpto.algorithms.interfaces import Agent
+from sb3_rpto.dynamics.factory import is_mujoco
+from sb3_rpto.effects import LIBRARY, Declared, Effect, from_json
+from sb3_rpto.effects.library import given as check_declared
+from sb3_rpto.effects.mjcf import PlainModel
 from sb3_rpto.effects.names import near
+from sb3_rpto.envs.corrected import check_carries
+from sb3_rpto.envs.observations import single_env
+from sb3_rpto.envs.task_rules import misfit
 from sb3_rpto.ranges import check
-
-if TYPE_CHECKING:
-    from sb3_rpto.algorithms.closed_loop.controller import LoopCloser
 
 #: Arguments that only an algorithm with trainable dynamics has a use for.
 DYNAMICS_ARGUMENTS = frozenset(
@@ -31,6 +37,7 @@ DYNAMICS_ARGUMENTS = frozenset(
         "dynamics_kwargs",
         "declared",
         "close_loop",
+        "effects",
         "retrain_steps",
         "weighting",
         "weight_floor",
@@ -174,7 +181,7 @@ def check_applicable(algorithm: str, updates_dynamics: bool, passed: Collection[
         raise ValueError(f"{algorithm} does not use {inapplicable}; leave them out or use RPTO")
 
 
-def check_values_of(model: TwoWorlds) -> None:
+def check_values_of(model: Agent) -> None:
     """Refuse values out of range in a model that is made: a preset, a subclass or a checkpoint may have set them.
 
     :raises ValueError: naming the argument and what it must be
@@ -210,7 +217,7 @@ def begin_temperature(model: SAC, ent_coef: Any) -> None:
         model.log_ent_coef.data.fill_(math.log(float(begin)))
 
 
-def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | None, **others: Any) -> None:
+def check_ready(agent: Agent, total_timesteps: int, source_timesteps: int | None, **others: Any) -> None:
     """Refuse to learn without both worlds or with a budget that makes no sense; arguments as those of ``learn()``.
 
     :raises ValueError: naming what is missing or wrong
@@ -218,75 +225,207 @@ def check_ready(model: TwoWorlds, total_timesteps: int, source_timesteps: int | 
     check(
         argument_ranges.OF_LEARN, {"total_timesteps": total_timesteps, "source_timesteps": source_timesteps, **others}
     )
-    if model.env is None:
+    if agent.env is None:
         raise ValueError("learn() needs the source environment: pass env= to load(), or call set_env()")
-    if model.env.env_is_wrapped(Monitor)[0] and not model.env.get_attr("allow_early_resets", indices=[0])[0]:
+    if agent.env.env_is_wrapped(Monitor)[0] and not agent.env.get_attr("allow_early_resets", indices=[0])[0]:
         raise ValueError("env is in a Monitor(allow_early_resets=False), but is reset between phases; leave it True")
-    if model.target_env is None and not model._offline:
+    if agent.target is None:
         raise ValueError(
             "learn() needs the target: pass target_env= (an environment to interact with) or target_data= "
             "(recorded transitions, RTO and RPTO) to the constructor, or call set_target_env()"
         )
-    if model.target_env is not None and total_timesteps < model.target_env.num_envs:
+    if total_timesteps < agent.target.n_envs:
         raise ValueError(
-            f"total_timesteps={total_timesteps} is less than one step of target_env's {model.target_env.num_envs} "
+            f"total_timesteps={total_timesteps} is less than one step of target_env's {agent.target.n_envs} "
             "environments; raise it or use fewer"
         )
-    if model._offline and not model._traces_log and model.replay_buffer.target.size() == 0:
+    side = agent.replay_buffer.target
+    if agent.target_env is None and not agent.target.is_traced and side.size() == 0:
         raise ValueError("D_target is empty: a checkpoint does not hold the target_data; call load_replay_buffer()")
-    _warn_of_little(model, total_timesteps)
-    capacity = model.replay_buffer.target.buffer_size
-    if model.target_env is not None and total_timesteps > capacity:
+    warn_of_little(agent, total_timesteps)
+    if agent.target_env is not None and total_timesteps > side.buffer_size:
         warnings.warn(
-            f"D_target holds {capacity} transitions, fewer than the budget of {total_timesteps}; pass "
+            f"D_target holds {side.buffer_size} transitions, fewer than the budget of {total_timesteps}; pass "
             'replay_buffer_kwargs={"target_size": ...} to keep them all',
             stacklevel=3,
         )
 
 
-def warn_of_idle_source_phase(model: TwoWorlds, source_timesteps: int) -> None:
+def warn_of_idle_source_phase(agent: Agent, source_timesteps: int) -> None:
     """Say so where the source phase ends before its first update, and an untrained policy goes into the target.
 
     :param source_timesteps: its length; 0: nobody wants one
     """
-    if 0 < source_timesteps <= model.learning_starts:
+    if 0 < source_timesteps <= agent.learning_starts:
         warnings.warn(
             f"the source phase of {source_timesteps:,} steps ends before its first update (learning_starts="
-            f"{model.learning_starts:,}), so an untrained policy goes into the target; give learn() more "
+            f"{agent.learning_starts:,}), so an untrained policy goes into the target; give learn() more "
             "source_timesteps, a smaller learning_starts, or begin from a trained SAC by from_source()",
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
-def _warn_of_little(model: TwoWorlds, total_timesteps: int) -> None:
+def warn_of_little(agent: Agent, total_timesteps: int) -> None:
     """Say so where the budget ends before the dynamics are fitted, or with next to no updates."""
-    if model._offline:
-        steps = model._steps_of_round()
+    first_trace = _first_trace(agent)
+    if agent.target_env is None:
+        steps = agent.source_steps_per_target_step()
         rounds = -(-total_timesteps // steps)
-        updates = rounds * model.updates_per_step
-        if not model._n_updates and 0 < updates < FEW_UPDATES <= total_timesteps:  # one that goes on was told
+        updates = rounds * agent.updates_per_step
+        if not agent.n_updates and 0 < updates < FEW_UPDATES <= total_timesteps:  # one that goes on was told
             warnings.warn(
                 f"total_timesteps={total_timesteps} source steps are {rounds} rounds of {steps} (source_steps="
-                f"{model.source_steps}) with {model.updates_per_step} updates each by gradient_steps="
-                f"{model.gradient_steps}, {updates} in all; raise gradient_steps or total_timesteps",
+                f"{agent.source_steps}) with {agent.updates_per_step} updates each by gradient_steps="
+                f"{agent.gradient_steps}, {updates} in all; raise gradient_steps or total_timesteps",
                 stacklevel=4,
             )
-    elif model.loop is not None and _first_trace(model, model.loop) > total_timesteps:
+    elif first_trace > total_timesteps:
         warnings.warn(
             f"total_timesteps={total_timesteps} ends before the closed loop's first trace, for which it waits "
-            f"{_first_trace(model, model.loop)} target steps, until a fit (model_train_freq={model.model_train_freq}); "
-            "raise it",
+            f"{first_trace} target steps, until a fit (model_train_freq={agent.model_train_freq}); raise it",
             stacklevel=4,
         )
-    elif model.updates_dynamics and total_timesteps + model.replay_buffer.target.size() < model.model_train_freq:
+    elif agent.updates_dynamics and total_timesteps + agent.replay_buffer.target.size() < agent.model_train_freq:
         warnings.warn(
             f"total_timesteps={total_timesteps} ends before the first fit of the dynamics, after "
-            f"{model.model_train_freq} target steps; raise it, or lower model_train_freq",
+            f"{agent.model_train_freq} target steps; raise it, or lower model_train_freq",
             stacklevel=4,
         )
 
 
-def _first_trace(model: TwoWorlds, loop: LoopCloser) -> int:
+def _first_trace(agent: Agent) -> int:
     """After how many target steps the first trace is made: with enough of them, at a fit; 0 where it was."""
-    wait, done = loop.first_comes_after(model), model._since_fit
-    return max(wait, 0) and -(-(wait + done) // model.model_train_freq) * model.model_train_freq - done
+    wait, done = agent.loop.first_trace_after(agent), agent.state.steps_since_fit
+    return max(wait, 0) and -(-(wait + done) // agent.model_train_freq) * agent.model_train_freq - done
+
+
+# --- the dynamics and the closed loop ---------------------------------------------------------------------------------
+
+
+def check_effects(effects: Literal["all"] | Sequence[str]) -> None:
+    """Refuse kinds of effects that no trace can look for.
+
+    :param effects: "all", or the kinds of effects to look for
+    :raises TypeError: for a single kind, and for what is no kind
+    :raises ValueError: for a kind that is not in the library
+    """
+    if effects == "all":
+        return
+    if isinstance(effects, str):
+        raise TypeError(f'effects must be "all" or a list of kinds, not a string; write [{effects!r}]')
+    if not isinstance(effects, Sequence | Set):
+        raise TypeError(f'effects must be "all" or a list of kinds, not {effects!r}; leave it out')
+    for kind in effects:
+        if not isinstance(kind, str):
+            raise TypeError(
+                f"effects holds kinds of effects to look for, such as 'coulomb_friction', not {kind!r}; effects "
+                "that are known beforehand are dynamics_kwargs={'effects': [...]}"
+            )
+        if kind not in LIBRARY:
+            raise ValueError(f"effects: no effect {kind!r} is registered; {near(kind, LIBRARY)}")
+
+
+def check_backend(config: dict[str, Any], close_loop: bool, traces_log: bool, given: Collection[str]) -> None:
+    """Refuse what a backend has no use for, or would lose.
+
+    :param config: of the dynamics
+    :param close_loop: whether transitions are traced
+    :param traces_log: measurements stand in for the target
+    :param given: names of the arguments that the user passed
+    :raises ValueError: with the remedy
+    """
+    if close_loop and not (config["backend"] == "physical" and is_mujoco(config)):
+        raise ValueError(
+            "close_loop=True traces what a MuJoCo simulator lacks: pass dynamics='physical' and a gymnasium MuJoCo env"
+        )
+    if "effects" in given and not close_loop:
+        raise ValueError("effects says what to look for where the loop is closed: pass close_loop=True, too")
+    if config.get("observation_noise") is not None and (not close_loop or traces_log):
+        raise ValueError(
+            "dynamics_kwargs['observation_noise'] is for traces of a closed loop on transitions of the target; leave "
+            "it out, "
+            + (
+                "recordings tell their own: Measurements.from_replay(..., noise=...) where it is known"
+                if traces_log
+                else "or pass dynamics='physical' and close_loop=True on a MuJoCo env"
+            )
+        )
+    if config["backend"] == "physical" and "rollout_start" in given:
+        raise ValueError(
+            "rollout_start is for one-step branches; dynamics='physical' simulates whole episodes: leave it out"
+        )
+    residual = config["backend"] == "residual"
+    late = [e.label for e in map(from_json, config.get("effects", ())) if e.remembers] if residual else []
+    if late:
+        raise ValueError(
+            f"dynamics='residual' answers each step from its observation alone, where {', '.join(late)} would be lost; "
+            "pass dynamics='physical', which simulates whole episodes"
+        )
+
+
+def check_carried(env: VecEnv, effects: Literal["all"] | Sequence[str]) -> None:
+    """Refuse a source in which nothing that a trace may find could act: the target steps would be spent by then.
+
+    :param env: the source, a MuJoCo environment
+    :param effects: "all", or the kinds of effects to look for
+    :raises ValueError: with the remedy
+    """
+    kinds = [kind for kind, effect in LIBRARY.items() if effect.offered] if effects == "all" else effects
+    try:
+        check_carries(single_env(env), kinds)
+    except ValueError as error:
+        raise ValueError(
+            f"effects={effects!r}: {error}; or pass effects=[...] with kinds that are numbers of the model alone"
+        ) from error
+
+
+def check_something_to_fit(
+    config: dict[str, Any], close_loop: bool, effects: Literal["all"] | Sequence[str], traces_log: bool
+) -> None:
+    """Refuse a MuJoCo simulator without parameters, and those that a trace would refuse after many target steps.
+
+    :param config: of the dynamics
+    :param close_loop: whether transitions are traced
+    :param effects: "all", or the kinds of effects to look for
+    :param traces_log: measurements stand in for the target
+    :raises ValueError: with the remedy
+    """
+    if config["backend"] != "physical" or not is_mujoco(config):
+        return
+    if close_loop or traces_log:
+        model = config["mj_model"]
+        compiled = model.compile() if isinstance(model, PlainModel) else model
+        check_declared(
+            compiled, config.get("declared", ()), [from_json(stored) for stored in config.get("effects", ())]
+        )
+    if not (close_loop and effects) and not config.get("declared") and not config.get("effects"):
+        raise ValueError(
+            "dynamics='physical' has nothing to fit: pass declared=[...], names of the model's numbers such as "
+            "'hinge.damping' or '*.mass', or close_loop=True"
+        )
+
+
+def check_rules(kwargs: dict[str, Any], observation_space: spaces.Space, action_space: spaces.Space) -> None:
+    """Refuse rules of the user's that answer in another form than the dynamics read.
+
+    :param kwargs: of the dynamics
+    :param observation_space: both worlds'
+    :param action_space: both worlds'
+    :raises ValueError: naming the rule and what it gave
+    """
+    for name in ("reward_fn", "termination_fn"):
+        if kwargs.get(name) is None:
+            continue
+        try:
+            cloudpickle.dumps(kwargs[name])
+        except Exception as error:  # whatever an object's own pickling raises
+            raise ValueError(
+                f"dynamics_kwargs[{name!r}] does not pickle ({error}), and checkpoints hold it; give a function of the "
+                "tensors alone"
+            ) from error
+        found = misfit(kwargs[name], observation_space, action_space)
+        if found is not None:
+            raise ValueError(
+                f"dynamics_kwargs[{name!r}] must answer n observations, actions and next observations by a tensor of "
+                f"shape (n,); of two it made {found}"
+            )

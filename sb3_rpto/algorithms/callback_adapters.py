@@ -10,8 +10,8 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_rpto.algorithms.environment_checks import members
 from sb3_rpto.algorithms.normalisation import normalises
-from sb3_rpto.algorithms.target import members
 
 
 def check_callbacks(callback: BaseCallback, source: VecEnv | None, target_env: VecEnv | None) -> None:

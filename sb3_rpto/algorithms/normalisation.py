@@ -327,6 +327,16 @@ def share(own: VecNormalize, statistics: VecNormalize) -> None:
     own.ret_rms = statistics.ret_rms
 
 
+def share_normalisation(venv: VecEnv, source: VecEnv | None) -> VecEnv:
+    """Wrap ``venv`` so that it is normalised by the source's running statistics, which it never updates."""
+    statistics = unwrap_vec_normalize(source) if source is not None else None
+    if statistics is None:
+        return venv
+    shared = VecNormalize(venv, training=False, norm_obs=statistics.norm_obs)
+    share(shared, statistics)
+    return shared
+
+
 def _without(venv: VecEnv, own: VecNormalize) -> VecEnv:
     """A VecEnv with the same wrappers but for one."""
     if venv is own:

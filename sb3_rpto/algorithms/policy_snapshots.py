@@ -2,61 +2,64 @@
 
 from __future__ import annotations
 
+from collections import UserDict
 from typing import Any, Literal
 
 import numpy as np
+import torch as th
+from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_rpto.algorithms.update import RelativeUpdate
 
+class PolicySnapshots(UserDict[str, dict[str, Any]]):
+    """Policies by name: actor, critics and temperature, on the CPU.
 
-class PolicySnapshots(RelativeUpdate):
-    """Keeps the policy that came from the source and the best one seen in the target."""
+    There is "source" (as it came), "best" (highest return in the target), and where the loop is closed "simulator"
+    (highest return in the fitted simulator) and "learner" (goes on learning while that one acts).
+    """
 
-    #: by name: "source" (as it came), "best" (highest return in the target), "simulator" (in the fitted simulator),
-    #: "learner" (goes on learning while that one acts)
-    snapshots: dict[str, dict[str, Any]]
-    best_mean_reward: float
-    #: what ``best_mean_reward`` is: the mean of recent training episodes, or an evaluation (``callbacks.KeepBest``)
-    best_by: Literal["training", "evaluation"] = "training"
+    def __init__(self) -> None:
+        super().__init__()
+        #: return of "best" in the target
+        self.best_mean_reward = -np.inf
+        #: how it was measured: by recent training episodes, or by an evaluation (``callbacks.KeepBest``)
+        self.best_by: Literal["training", "evaluation"] = "training"
 
-    def keep_if_best(self, mean_reward: float) -> bool:
-        """Keep the current policy as "best" if it earned more than any before.
+    def take(self, name: str, policy: SACPolicy, temperature: th.Tensor) -> None:
+        """Keep a policy.
 
-        :param mean_reward: its return in the target, however it was measured
-        :return: whether it was kept
+        :param name: to keep it under
+        :param policy: actor and critics
+        :param temperature: SAC's entropy coefficient
         """
+        state = {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}
+        self[name] = {"policy": state, "temperature": float(temperature)}
+
+    def put_back(self, name: str, policy: SACPolicy, log_ent_coef: th.Tensor | None) -> None:
+        """Go back to a policy that was kept.
+
+        :param name: of it
+        :param policy: that gets its parameters
+        :param log_ent_coef: the logarithm of SAC's entropy coefficient, where it is learned
+        :raises ValueError: when there is no such policy yet
+        """
+        if name not in self:
+            until = '; "simulator" is kept once a trace is complete or explained' if name == "simulator" else ""
+            raise ValueError(f"no policy {name!r} to roll back to; there is {sorted(self) or 'none yet'}{until}")
+        snapshot = self[name]
+        self.pop("learner", None)  # what goes on learning is this one
+        policy.load_state_dict(snapshot["policy"])
+        if log_ent_coef is not None:
+            log_ent_coef.data.fill_(float(np.log(snapshot["temperature"])))
+
+    def is_best(self, mean_reward: float) -> bool:
+        """Whether a policy earned more in the target than any before, which is noted."""
         if mean_reward <= self.best_mean_reward:
             return False
         self.best_mean_reward = mean_reward
-        self.take_snapshot("best")
         return True
 
     def forget_best(self) -> None:
         """Begin anew to look for the best policy, in the target and in the simulator that is fitted to it."""
         self.best_mean_reward = -np.inf
-        self.snapshots.pop("best", None)
-        self.snapshots.pop("simulator", None)
-        self.snapshots.pop("learner", None)
-
-    def rollback(self, to: str = "best") -> None:
-        """Go back to a policy that was kept; a VecNormalize keeps the statistics that it has now.
-
-        :param to: "best" (in the target), "source" (as it came) or, where a trace accounts for the target,
-            "simulator" (the best in the fitted one); restores actor, critics and temperature
-        :raises ValueError: when there is no such policy yet
-        """
-        if to not in self.snapshots:
-            until = '; "simulator" is kept once a trace is complete or explained' if to == "simulator" else ""
-            raise ValueError(
-                f"no policy {to!r} to roll back to; there is {sorted(self.snapshots) or 'none yet'}{until}"
-            )
-        snapshot = self.snapshots[to]
-        self.snapshots.pop("learner", None)  # what goes on learning is this one
-        self.policy.load_state_dict(snapshot["policy"])
-        if self.log_ent_coef is not None:
-            self.log_ent_coef.data.fill_(float(np.log(snapshot["temperature"])))
-
-    def take_snapshot(self, name: str) -> None:
-        """Keep actor, critics and temperature under ``name``, on the CPU."""
-        state = {key: value.detach().cpu().clone() for key, value in self.policy.state_dict().items()}
-        self.snapshots[name] = {"policy": state, "temperature": float(self.temperature())}
+        for name in ("best", "simulator", "learner"):
+            self.pop(name, None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
@@ -13,12 +12,12 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_rpto.algorithms.target import last_observations, share_normalisation
-from sb3_rpto.algorithms.transition_checks import Answers, check_finite
-from sb3_rpto.algorithms.update import RelativeUpdate
+from sb3_rpto.algorithms.interfaces import Agent, SourceRollouts
+from sb3_rpto.algorithms.normalisation import share_normalisation
+from sb3_rpto.algorithms.transition_checks import Answers, check_finite, last_observations
 from sb3_rpto.dynamics.base import Dynamics, Prediction
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.residual import ResidualDynamics
@@ -36,39 +35,7 @@ NUDGE = 1e-3
 REDRAWN = 100
 
 
-class SourceWorld(ABC):
-    """The world that step 3 acts in."""
-
-    @abstractmethod
-    def interact(self, model: RelativeUpdate, n_steps: int) -> int:
-        """Take at least ``n_steps`` steps and store every transition.
-
-        :param model: whose policy acts and whose D_source is filled; its ``source_timesteps`` count them
-        :param n_steps: number of transitions
-        :return: the number of transitions stored
-        """
-
-    def log(self) -> dict[str, float]:
-        """What to log of the source's episodes; empty where it has none."""
-        return {}
-
-    def begin_anew(self) -> None:  # noqa: B027
-        """Leave the episodes under way: the next step is the first of others."""
-
-    def get_state(self) -> dict[str, Any]:
-        """Where the episodes stand, beside the source environment's own state; empty where there are none."""
-        return {}
-
-    def set_state(self, state: dict[str, Any]) -> None:  # noqa: B027
-        """Continue where :meth:`get_state` was called; the source environment's own state is restored elsewhere."""
-
-    def reseed(self) -> None:  # noqa: B027
-        """Draw new random streams of its own from the dynamics', which were seeded just now."""
-
-
-def make_source_world(
-    env: VecEnv, dynamics: Dynamics | None, rollout_start: RolloutStart, num_envs: int
-) -> SourceWorld:
+def make_rollouts(env: VecEnv, dynamics: Dynamics | None, rollout_start: RolloutStart, num_envs: int) -> SourceRollouts:
     """The source as the model's backend rolls it out: itself (no dynamics), branches, or simulated episodes.
 
     :param env: the real source
@@ -87,7 +54,7 @@ def make_source_world(
     return EpisodeSource(share_normalisation(DynamicsVecEnv(dynamics, env, num_envs), env))
 
 
-class EpisodeSource(SourceWorld):
+class EpisodeSource(SourceRollouts):
     """Whole episodes of a source VecEnv: the real simulator (RPO) or one that the dynamics answer.
 
     :param env: stepped by the current stochastic policy
@@ -106,10 +73,10 @@ class EpisodeSource(SourceWorld):
         self._left_at: list[tuple[Any, ...]] | None = whereabouts(env)
         self._last_raw: np.ndarray | None = None if first_obs is None else self._raw(first_obs)
 
-    def interact(self, model: RelativeUpdate, n_steps: int, random: bool = False) -> int:
+    def interact(self, agent: Agent, n_steps: int, random: bool = False) -> int:
         """Step at least ``n_steps`` times, counted in all environments together, and store every transition.
 
-        :param model: whose policy acts and whose D_source is filled
+        :param agent: whose policy acts and whose D_source is filled
         :param n_steps: number of transitions
         :param random: uniform actions instead of the policy's
         :return: the number of transitions stored
@@ -122,17 +89,17 @@ class EpisodeSource(SourceWorld):
                 self._last_obs = np.asarray(self.env.reset())
             self._last_raw = self._raw(self._last_obs)
         assert self._last_raw is not None  # it comes and goes with _last_obs
-        model.policy.set_training_mode(False)
+        agent.policy.set_training_mode(False)
         steps, held = 0, math.inf  # for how many steps gSDE's noise was held
         while steps < n_steps:
             if random:
-                actions = np.array([model.action_space.sample() for _ in range(self.env.num_envs)])
+                actions = np.array([agent.action_space.sample() for _ in range(self.env.num_envs)])
             else:
-                if model.use_sde and held >= _sde_hold(model):
-                    model.actor.reset_noise(self.env.num_envs)
+                if agent.use_sde and held >= _sde_hold(agent):
+                    agent.actor.reset_noise(self.env.num_envs)
                     held = 0
                 held += 1
-                actions, _ = model.policy.predict(self._last_obs, deterministic=False)
+                actions, _ = agent.policy.predict(self._last_obs, deterministic=False)
             with self._answers.received():
                 new_obs, rewards, dones, infos = self.env.step(actions)
             raw_obs, raw_next = self._last_raw, self._raw(new_obs)
@@ -144,9 +111,9 @@ class EpisodeSource(SourceWorld):
             scaled_later = normaliser is not None and normaliser.norm_reward
             self._answers.check(raw_next, np.asarray(rewards), self.env.observation_space.shape or (), scaled_later)
             timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
-            scaled = model.policy.scale_action(actions)
-            model.replay_buffer.append("source", raw_obs, raw_next, scaled, rewards, dones, timeouts, infos)
-            if dones.any() and _draws_by_episode(model):
+            scaled = agent.policy.scale_action(actions)
+            agent.replay_buffer.append("source", raw_obs, raw_next, scaled, rewards, dones, timeouts, infos)
+            if dones.any() and _draws_by_episode(agent):
                 held = math.inf
             for info in infos:
                 if "episode" in info:
@@ -154,7 +121,7 @@ class EpisodeSource(SourceWorld):
                     self.lengths.append(info["episode"]["l"])
             self._last_obs = np.asarray(new_obs)
             steps += self.env.num_envs
-            model.source_timesteps += self.env.num_envs  # each as it is taken: the rest may be interrupted
+            agent.state.source_timesteps += self.env.num_envs  # each as it is taken: the rest may be interrupted
         self._left_at = whereabouts(self.env)
         return steps
 
@@ -169,11 +136,11 @@ class EpisodeSource(SourceWorld):
         return {"ep_rew_mean": float(np.mean(self.returns)), "ep_len_mean": float(np.mean(self.lengths))}
 
     def begin_anew(self) -> None:
-        """See :meth:`SourceWorld.begin_anew`."""
+        """See :meth:`SourceRollouts.begin_anew`."""
         self._last_obs = self._last_raw = None
 
     def get_state(self) -> dict[str, Any]:
-        """Where the episodes stand; see :meth:`SourceWorld.get_state`."""
+        """Where the episodes stand; see :meth:`SourceRollouts.get_state`."""
         inner = self.env.unwrapped
         model = inner.get_state() if isinstance(inner, DynamicsVecEnv) else None
         return {"model": model, **{name: getattr(self, name) for name in self._STATE}}
@@ -228,7 +195,7 @@ class SimulatorSource(EpisodeSource):
         super().__init__(share_normalisation(stacked, env))
 
     def reseed(self) -> None:
-        """See :meth:`SourceWorld.reseed`."""
+        """See :meth:`SourceRollouts.reseed`."""
         reseed(self.env, self._draw())
         self._rng = np.random.default_rng(self._draw())
 
@@ -238,13 +205,13 @@ class SimulatorSource(EpisodeSource):
     def _current(self) -> tuple[Any, ...]:
         return (*self.dynamics.names, *self.dynamics.values.tolist())
 
-    def interact(self, model: RelativeUpdate, n_steps: int, random: bool = False) -> int:
+    def interact(self, agent: Agent, n_steps: int, random: bool = False) -> int:
         """As in :class:`EpisodeSource`; episodes under way go on where they are when phi has moved."""
         if self._current() != self._phi:
             self._phi = self._current()
             for copy in self.copies:
                 copy.set_effects(self.dynamics.effects(self._rng))
-        return super().interact(model, n_steps, random)
+        return super().interact(agent, n_steps, random)
 
     def _simulator(self, copy: gym.Env) -> StandingEnv:
         effects = self.dynamics.effects()
@@ -308,7 +275,7 @@ def copied(env: VecEnv) -> gym.Env:
         ) from error
 
 
-class BranchSource(SourceWorld):
+class BranchSource(SourceRollouts):
     """One-step branches of the learned dynamics (horizon 1) from states of the target, the source, or both.
 
     :param dynamics: answers the step
@@ -319,42 +286,42 @@ class BranchSource(SourceWorld):
         self.dynamics = dynamics
         self.rollout_start = rollout_start
 
-    def interact(self, model: RelativeUpdate, n_steps: int) -> int:
+    def interact(self, agent: Agent, n_steps: int) -> int:
         """Branch ``n_steps`` times, all at once, but not more often than D_source holds."""
-        n_steps = min(n_steps, model.replay_buffer.source.buffer_size)
-        starts = self._starts(model, n_steps)
-        normaliser = model.get_vec_normalize_env()
+        n_steps = min(n_steps, agent.replay_buffer.source.buffer_size)
+        starts = self._starts(agent, n_steps)
+        normaliser = agent.get_vec_normalize_env()
         seen = starts if normaliser is None else normaliser.normalize_obs(starts)
-        model.policy.set_training_mode(False)
-        scaled = sample_policy(model, th.as_tensor(seen, device=model.device).float())
-        actions = model.unscale_actions(scaled)
-        answer = self.answer(model, th.as_tensor(starts, device=model.device), actions)
+        agent.policy.set_training_mode(False)
+        scaled = sample_policy(agent, th.as_tensor(seen, device=agent.device).float())
+        actions = agent.unscale_actions(scaled)
+        answer = self.answer(agent, th.as_tensor(starts, device=agent.device), actions)
         next_obs, rewards = answer.next_observations.cpu().numpy(), answer.rewards.cpu().numpy()
         check_finite("modelled source", observation=next_obs, reward=rewards)
-        next_obs = next_obs.clip(model.observation_space.low, model.observation_space.high)
+        next_obs = next_obs.clip(agent.observation_space.low, agent.observation_space.high)
         terminations = answer.terminations.cpu().numpy()
-        model.replay_buffer.append("source", starts, next_obs, scaled.cpu().numpy(), rewards, terminations)
-        model.source_timesteps += n_steps
+        agent.replay_buffer.append("source", starts, next_obs, scaled.cpu().numpy(), rewards, terminations)
+        agent.state.source_timesteps += n_steps
         return n_steps
 
-    def answer(self, model: RelativeUpdate, observations: th.Tensor, actions: th.Tensor) -> Prediction:
+    def answer(self, agent: Agent, observations: th.Tensor, actions: th.Tensor) -> Prediction:
         """What follows each branch's observation (n, observation_dim) and action (n, action_dim), in their units."""
         return self.dynamics.step(observations, actions, deterministic=False)
 
-    def target_rows(self, model: RelativeUpdate, n: int) -> np.ndarray:
+    def target_rows(self, agent: Agent, n: int) -> np.ndarray:
         """Rows of D_target to branch from, (n,)."""
-        return np.random.randint(model.replay_buffer.target.size(), size=n)
+        return np.random.randint(agent.replay_buffer.target.size(), size=n)
 
-    def _starts(self, model: RelativeUpdate, n: int) -> np.ndarray:
+    def _starts(self, agent: Agent, n: int) -> np.ndarray:
         """Observations to branch from, (n, observation_dim), raw."""
-        buffer = model.replay_buffer
+        buffer = agent.replay_buffer
         odd = int(np.random.randint(2)) if self.rollout_start == "mix" and n % 2 else 0
         n_target = {"target": n, "source": 0, "mix": n // 2 + odd}[self.rollout_start]
         if buffer.target.size() == 0:
             n_target = 0  # before the first target transition only the source has states
         pools = []
         if n_target > 0:
-            pools.append(self._known(n_target, lambda k: buffer.target.observations[self.target_rows(model, k), 0]))
+            pools.append(self._known(n_target, lambda k: buffer.target.observations[self.target_rows(agent, k), 0]))
         if n > n_target:
             rows = len(buffer.source_starts)
             pools.append(self._known(n - n_target, lambda k: buffer.source_starts[np.random.randint(rows, size=k)]))
@@ -373,25 +340,23 @@ class BranchSource(SourceWorld):
         return found
 
 
-def sample_policy(model: RelativeUpdate, observations: th.Tensor) -> th.Tensor:
+def sample_policy(agent: Agent, observations: th.Tensor) -> th.Tensor:
     """Actions of the stochastic policy in [-1, 1], (n, action_dim), each with noise of its own under gSDE, too.
 
     :param observations: as the policy sees them, (n, observation_dim)
     """
-    if model.use_sde:
-        model.actor.reset_noise(len(observations))
+    if agent.use_sde:
+        agent.actor.reset_noise(len(observations))
     with th.no_grad():
-        return model.policy._predict(observations, deterministic=False)
+        return agent.policy(observations, deterministic=False)
 
 
-def _sde_hold(model: RelativeUpdate) -> float:
+def _sde_hold(agent: Agent) -> float:
     """For how many steps gSDE's noise is held, as in the target: SB3 draws anew with each rollout, or more often."""
-    assert isinstance(model.train_freq, TrainFreq)  # an int until SB3's _setup_model
-    held = math.inf if _draws_by_episode(model) else model.train_freq.frequency
-    return min(held, model.sde_sample_freq if model.sde_sample_freq > 0 else math.inf)
+    held = math.inf if _draws_by_episode(agent) else agent.train_freq.frequency
+    return min(held, agent.sde_sample_freq if agent.sde_sample_freq > 0 else math.inf)
 
 
-def _draws_by_episode(model: RelativeUpdate) -> bool:
+def _draws_by_episode(agent: Agent) -> bool:
     """Whether a rollout, and with it gSDE's noise, lasts for episodes."""
-    assert isinstance(model.train_freq, TrainFreq)  # as above
-    return model.train_freq.unit == TrainFrequencyUnit.EPISODE
+    return agent.train_freq.unit == TrainFrequencyUnit.EPISODE

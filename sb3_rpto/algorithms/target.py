@@ -1,26 +1,122 @@
-"""The two worlds' environments: what they must satisfy, how target steps are counted, shared normalisation."""
+"""Where D_target comes from: an environment whose every step is counted, or a log."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 
-from sb3_rpto.algorithms.normalisation import share
-from sb3_rpto.algorithms.transition_checks import Answers, check_finite
+from sb3_rpto.algorithms.interfaces import Agent, Target
+from sb3_rpto.algorithms.normalisation import share_normalisation
+from sb3_rpto.algorithms.transition_checks import Answers, check_finite, last_observations
 from sb3_rpto.envs.env_copy import copy_env
-from sb3_rpto.envs.env_snapshot import accepts_seed, restore_state, save_state, whereabouts
-from sb3_rpto.envs.observations import layers
+from sb3_rpto.envs.env_snapshot import restore_state, save_state, whereabouts
 
-#: They scale by what their own world has shown so far.
-NORMALISERS = (gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward)
+
+class OnlineTarget(Target):
+    """An environment: it counts its steps, shares the source's normalisation, and notices where it is no target.
+
+    :param venv: the environment
+    :param source: the source, whose VecNormalize it shares where there is one; None before it is known
+    :param spent: target steps by what they were spent on, counted on in place
+    """
+
+    is_traced = False
+    env: VecEnv
+
+    def __init__(self, venv: VecEnv, source: VecEnv | None, spent: dict[str, int]) -> None:
+        self.ledger = TargetLedger(venv, spent)
+        self.share(source)
+        self.n_envs = venv.num_envs
+        #: compares its first steps with the source's, as long as nothing is known
+        self.null_shift: NullShiftCheck | None = None
+
+    @property
+    def raw(self) -> VecEnv:
+        """The environment itself, not normalised and not counted."""
+        return self.ledger.venv
+
+    @property
+    def normaliser(self) -> VecNormalize | None:
+        """By which the policy sees it."""
+        return unwrap_vec_normalize(self.env)
+
+    def share(self, source: VecEnv | None) -> None:
+        """Be normalised by the source's running statistics."""
+        self.env = share_normalisation(self.ledger, source)
+
+    def source_steps(self, agent: Agent) -> int:
+        """Those for the target steps of the next rollout; of whole episodes, as many as in the last one.
+
+        What several copies took too much, or the last rollout turned out to need more or less, is made up for.
+        """
+        coming = min(agent.state.rollout_timesteps, agent.steps_left())
+        if agent.train_freq.unit == TrainFrequencyUnit.STEP:
+            coming = agent.target_rollout_length().frequency * self.n_envs
+        return agent.state.source_steps_due + coming * agent.source_steps_per_target_step()
+
+    def collect(self, agent: Agent, callback: BaseCallback, log_interval: int | None) -> bool:
+        """Act in the environment and fill D_target; SB3's own code collects, within the budget."""
+        return agent.collect_in_target(callback, log_interval)
+
+    def check_step(self, new_obs: Any, rewards: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[int, Any]:
+        """Look at a step before it is stored.
+
+        :return: the observations at the ends of episodes, by the index of the environment
+        :raises ValueError: for what cannot be stored
+        """
+        ended = last_observations("target", self.env, dones, infos)
+        normaliser = self.normaliser
+        raw: Any = new_obs, rewards
+        if normaliser is not None:  # which clips what is infinite, and what is stored comes from below it
+            raw = normaliser.get_original_obs(), normaliser.get_original_reward()
+        normalised = normaliser is not None and normaliser.norm_reward
+        self.ledger.check(*map(np.asarray, raw), *ended.values(), normalised=normalised)
+        return ended
+
+    def compare_with_source(self, action: np.ndarray, next_observation: np.ndarray, done: bool) -> None:
+        """Warn when the step just stored is the last of many that the source would have answered alike.
+
+        :param action: (1, action_dim), what the first environment received
+        :param next_observation: (observation_dim,), what it answered
+        :param done: whether its episode ended
+        """
+        assert self.null_shift is not None  # else there is nothing to compare
+        same = self.null_shift.agrees(action, next_observation, done)
+        if same is not None:
+            self.null_shift = None
+        if same:
+            warnings.warn(
+                "target_env has stepped exactly like env so far: is it the world you meant? (Nothing to transfer.)",
+                stacklevel=3,
+            )
+
+
+class OfflineTarget(Target):
+    """A log that stands in for the target: ``num_timesteps`` counts source steps then.
+
+    :param is_traced: whether it is one of measurements, and phi comes from a trace of it
+    """
+
+    env = None
+    n_envs = 1
+
+    def __init__(self, is_traced: bool = False) -> None:
+        self.is_traced = is_traced
+
+    def source_steps(self, agent: Agent) -> int:
+        """Those of a round, within the budget, which is one of source steps."""
+        return min(agent.state.source_steps_due + agent.source_steps_per_target_step(), agent.steps_left())
+
+    def collect(self, agent: Agent, callback: BaseCallback, log_interval: int | None) -> bool:
+        """Only count the source steps that were just taken."""
+        return agent.count_steps(agent.source_steps_per_target_step(), callback)
 
 
 class TargetLedger(VecEnvWrapper):
@@ -146,145 +242,6 @@ class TargetLedger(VecEnvWrapper):
             answer = self.venv.reset()
         self._left_at = whereabouts(self.venv)
         return answer
-
-
-def find_ledger(venv: VecEnv) -> TargetLedger:
-    """The ledger inside a target that :func:`share_normalisation` may have wrapped."""
-    while not isinstance(venv, TargetLedger):
-        venv = venv.venv  # type: ignore[attr-defined]
-    return venv
-
-
-def share_normalisation(venv: VecEnv, source: VecEnv | None) -> VecEnv:
-    """Wrap ``venv`` so that it is normalised by the source's running statistics, which it never updates."""
-    statistics = unwrap_vec_normalize(source) if source is not None else None
-    if statistics is None:
-        return venv
-    shared = VecNormalize(venv, training=False, norm_obs=statistics.norm_obs)
-    share(shared, statistics)
-    return shared
-
-
-def last_observations(
-    world: str, env: VecEnv, dones: np.ndarray, infos: Sequence[dict[str, Any]]
-) -> dict[int, np.ndarray]:
-    """The observations at the ends of episodes as the environments gave them, by the index of the environment.
-
-    What a step returns there is of the episode that follows.
-
-    :param world: what to call it
-    :param env: the world's VecEnv with all its wrappers, just stepped
-    :param dones: (n,), whether an episode ended
-    :param infos: (n,), what came with it
-    :raises ValueError: a VecEnv that does not tell
-    """
-    found = {}
-    for i in map(int, np.flatnonzero(dones)):
-        if "terminal_observation" not in infos[i]:
-            raise ValueError(
-                f"the {world}'s VecEnv ended an episode without info['terminal_observation'], so its last transition "
-                "is unknown; put it there, as the VecEnvs of Stable-Baselines3 do"
-            )
-        found[i] = _raw_terminal(env, i, infos[i]["terminal_observation"])
-    return found
-
-
-def _raw_terminal(env: VecEnv, index: int, terminal: np.ndarray) -> np.ndarray:
-    """The observation at the end of an episode as the environment gave it.
-
-    A VecNormalize clips what it hands on: far out states, such as falls are, cannot be had back from that. A
-    DummyVecEnv still holds them.
-
-    :param env: the worlds' VecEnv with all its wrappers, just stepped
-    :param index: of the environment whose episode ended
-    :param terminal: ``info["terminal_observation"]`` as it came out of ``env``
-    """
-    normaliser = unwrap_vec_normalize(env)
-    if normaliser is None:
-        return terminal
-    inner = env.unwrapped
-    held = inner.buf_infos[index].get("terminal_observation") if isinstance(inner, DummyVecEnv) else None
-    if held is None or np.shape(held) != terminal.shape:  # as it is below a VecFrameStack
-        return normaliser.unnormalize_obs(terminal)  # type: ignore[return-value]
-    if np.allclose(np.asarray(normaliser.normalize_obs(held)), terminal):
-        return np.asarray(held)
-    return normaliser.unnormalize_obs(terminal)  # type: ignore[return-value]
-
-
-def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
-    """Refuse what the algorithms are not written for.
-
-    :raises NotImplementedError: for observations or actions that are not a flat Box
-    """
-    if not isinstance(observation_space, spaces.Box) or is_image_space(observation_space):
-        raise NotImplementedError(
-            f"env has the observation space {observation_space}; only flat Box observations are supported "
-            "(wrap a Dict in gymnasium.wrappers.FlattenObservation)"
-        )
-    if len(observation_space.shape) != 1:
-        raise NotImplementedError(
-            f"env has observations of shape {observation_space.shape}; flatten them with "
-            "gymnasium.wrappers.FlattenObservation"
-        )
-    if not isinstance(action_space, spaces.Box):
-        raise NotImplementedError(
-            f"env has the action space {action_space}; only continuous (Box) actions are supported"
-        )
-    if len(action_space.shape) != 1:
-        raise NotImplementedError(
-            f"env has actions of shape {action_space.shape}; only flat ones are supported (let a "
-            "gymnasium.wrappers.TransformAction with a flat Box reshape them for the environment)"
-        )
-
-
-def check_pair(source: VecEnv, target: VecEnv) -> None:
-    """Refuse a target that cannot be the source's target.
-
-    :raises ValueError: for the same environment object, unequal spaces, or statistics of one world alone
-    """
-    if members(source) & members(target):
-        raise ValueError("target_env is env: both worlds would step the same object; build a second environment")
-    for name, world in (("env", source), ("target_env", target)):
-        found = [x for env in _inside(world) for x in layers(env) if isinstance(x, NORMALISERS)]
-        if found:
-            raise ValueError(
-                f"{name} is in gymnasium's {type(found[0]).__name__}, whose statistics are each world's own and drift; "
-                "wrap env (the source) in stable_baselines3's VecNormalize instead, the target then shares its "
-                "statistics"
-            )
-    for name in ("observation_space", "action_space"):
-        of_source, of_target = getattr(source, name), getattr(target, name)
-        if of_source != of_target:
-            raise ValueError(
-                f"target_env has {name} {of_target}, env has {of_source}; source and target must share their spaces"
-            )
-
-
-def check_environment(env: gym.Env | VecEnv, name: str) -> None:
-    """Refuse what is no environment, and one that cannot be reset with a seed.
-
-    :raises TypeError: naming the argument
-    :raises ValueError: naming the argument
-    """
-    if not isinstance(env, gym.Env | VecEnv):
-        raise TypeError(
-            f"{name} must be a gymnasium environment, a VecEnv, an id or a function that makes one, not "
-            f"{type(env).__name__}; stack several by make_vec_env, and pass recordings as target_data="
-        )
-    if isinstance(env, gym.Env) and not accepts_seed(env):
-        raise ValueError(
-            f"{name}: reset() of {env} takes no seed=; give it the signature reset(self, *, seed=None, options=None)"
-        )
-
-
-def members(venv: VecEnv) -> set[int]:
-    """Identities of the environments that a VecEnv steps; its own where they are in other processes."""
-    return {id(env.unwrapped) for env in _inside(venv)} or {id(venv.unwrapped)}
-
-
-def _inside(venv: VecEnv) -> list[gym.Env]:
-    """The environments that are in this process."""
-    return list(getattr(venv.unwrapped, "envs", []))
 
 
 class NullShiftCheck:

@@ -12,7 +12,9 @@ import mujoco
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_rpto.algorithms.interfaces import LoopController
 from sb3_rpto.algorithms.rollouts import try_source
+from sb3_rpto.algorithms.run_state import RunState
 from sb3_rpto.dynamics.base import Dynamics, Transitions
 from sb3_rpto.dynamics.cartpole import CartPoleDynamics, cartpole_constants
 from sb3_rpto.dynamics.physical import PhysicalDynamics
@@ -145,6 +147,24 @@ def _joint(name: str | None) -> str:
     return "no further joint" if name is None else f"the joint {name!r}"
 
 
+def check_fit(dynamics: Dynamics, error: float, data: Transitions, state: RunState, loop: LoopController) -> None:
+    """Say once what speaks against the target: after the first fit, with the loop closed after the first trace.
+
+    :param dynamics: after a fit
+    :param error: its one-step error on D_target
+    :param data: D_target
+    :param state: which checks were made
+    :param loop: what fits of the simulator are traced by
+    """
+    state.rules_checked = state.rules_checked or doubt_rules(dynamics, data)
+    if not loop.closed and not state.residual_checked:
+        state.residual_checked = doubt_what_is_left(dynamics, error, data)
+    if state.fit_checked or loop.awaits_trace():
+        return
+    state.fit_checked = True
+    doubt(dynamics, 0.0 if loop.freezes_dynamics else error, data)  # which is mostly noise there
+
+
 def doubt(dynamics: Dynamics, error: float, data: Transitions) -> None:
     """Warn of what speaks against a simulator that was just fitted.
 
@@ -162,7 +182,7 @@ def doubt(dynamics: Dynamics, error: float, data: Transitions) -> None:
         warnings.warn(
             "each one-step error undoes a part of the one before it, as where sensors are noisy: "
             "phi is biased then, by more than its standard errors say; declare fewer numbers, or give "
-            "close_loop=True (or a list of effects to look for, which may be empty), with "
+            "close_loop=True (effects=[...] says what to look for, which may be nothing), with "
             "dynamics_kwargs={'observation_noise': ...}: its traces reckon with noise",
             stacklevel=3,
         )

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 #: Networks learn float32: with rewards above the first the losses drown all else, above the second they overflow.
 LARGE, OVERFLOWS = 1e7, 1e15
@@ -115,3 +117,49 @@ def _unfit(error: Exception) -> str | None:
     if function in ("_save_obs", "_stack_obs"):
         return "observation"
     return "the end of the episode" if "truth value" in str(error) else "reward"
+
+
+def last_observations(
+    world: str, env: VecEnv, dones: np.ndarray, infos: Sequence[dict[str, Any]]
+) -> dict[int, np.ndarray]:
+    """The observations at the ends of episodes as the environments gave them, by the index of the environment.
+
+    What a step returns there is of the episode that follows.
+
+    :param world: what to call it
+    :param env: the world's VecEnv with all its wrappers, just stepped
+    :param dones: (n,), whether an episode ended
+    :param infos: (n,), what came with it
+    :raises ValueError: a VecEnv that does not tell
+    """
+    found = {}
+    for i in map(int, np.flatnonzero(dones)):
+        if "terminal_observation" not in infos[i]:
+            raise ValueError(
+                f"the {world}'s VecEnv ended an episode without info['terminal_observation'], so its last transition "
+                "is unknown; put it there, as the VecEnvs of Stable-Baselines3 do"
+            )
+        found[i] = _raw_terminal(env, i, infos[i]["terminal_observation"])
+    return found
+
+
+def _raw_terminal(env: VecEnv, index: int, terminal: np.ndarray) -> np.ndarray:
+    """The observation at the end of an episode as the environment gave it.
+
+    A VecNormalize clips what it hands on: far out states, such as falls are, cannot be had back from that. A
+    DummyVecEnv still holds them.
+
+    :param env: the worlds' VecEnv with all its wrappers, just stepped
+    :param index: of the environment whose episode ended
+    :param terminal: ``info["terminal_observation"]`` as it came out of ``env``
+    """
+    normaliser = unwrap_vec_normalize(env)
+    if normaliser is None:
+        return terminal
+    inner = env.unwrapped
+    held = inner.buf_infos[index].get("terminal_observation") if isinstance(inner, DummyVecEnv) else None
+    if held is None or np.shape(held) != terminal.shape:  # as it is below a VecFrameStack
+        return normaliser.unnormalize_obs(terminal)  # type: ignore[return-value]
+    if np.allclose(np.asarray(normaliser.normalize_obs(held)), terminal):
+        return np.asarray(held)
+    return normaliser.unnormalize_obs(terminal)  # type: ignore[return-value]

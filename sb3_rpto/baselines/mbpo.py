@@ -12,7 +12,9 @@ from sb3_rpto.envs.task_rules import env_id
 from sb3_rpto.presets import bare_name
 
 #: Arguments of RPTO that have no meaning where the model is fitted without weights and nothing is declared.
-UNUSED = frozenset({"preset", "dynamics", "declared", "close_loop", "retrain_steps", "weighting", "weight_floor"})
+UNUSED = frozenset(
+    {"preset", "dynamics", "declared", "close_loop", "effects", "retrain_steps", "weighting", "weight_floor"}
+)
 
 
 class MBPO(TransferAlgorithm):
@@ -24,8 +26,8 @@ class MBPO(TransferAlgorithm):
     It is the loop of :class:`~sb3_rpto.RPTO` with RTO's weights left out (``weighting=None``), branches from states of
     D_target alone, and one batch for critic and actor alike: D_source with a share ``real_ratio`` of D_target.
 
-    Of it PDML and PTP change above all ``_make_source_world`` (where branches start, which answer is kept) and how the
-    model is fitted (``fit_weights``, ``_fit_to_transitions``), SLBO ``_make_dynamics`` and ``update`` (another loss,
+    Of it PDML and PTP change above all ``make_rollouts`` (where branches start, which answer is kept) and how the
+    model is fitted (``fit_weights``, ``fit_dynamics``), SLBO ``make_dynamics`` and ``update_dynamics`` (another loss,
     another policy optimiser).
 
     :param args: as those of :class:`~sb3_rpto.algorithms.transfer.TransferAlgorithm`
@@ -57,15 +59,15 @@ class MBPO(TransferAlgorithm):
         return {**cls.NUMBERS, **cls.NUMBERS_OF_TASKS.get(bare_name(task_id), {})}
 
     def _apply_preset(self) -> None:
-        passed = self._passed - ({"source_steps"} if self.source_steps == "auto" else set())
+        given = self.given_arguments - ({"source_steps"} if self.source_steps == "auto" else set())
         for name, value in self.published(None if self.env is None else env_id(self.env)).items():
-            if name not in passed:
+            if name not in given:
                 setattr(self, name, value)
         self.weighting = None
 
-    def _check_arguments(self) -> None:
-        self.refuse_unused(self._passed)
-        super()._check_arguments()
+    def _check_arguments(self, offline: bool) -> None:
+        self.refuse_unused(self.given_arguments)
+        super()._check_arguments(offline)
 
     def sample_batches(self, count: int, batch_size: int) -> Iterator[tuple[ReplayBufferSamples, ReplayBufferSamples]]:
         """The critic's batches of RPTO, for the actor too."""

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_rpto.algorithms.rollouts import BranchSource, SourceWorld
-from sb3_rpto.algorithms.update import RelativeUpdate
+from sb3_rpto.algorithms.interfaces import Agent, SourceRollouts
+from sb3_rpto.algorithms.rollouts import BranchSource
 from sb3_rpto.baselines.mbpo import MBPO
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.envs.env_copy import EnvSource
@@ -65,12 +65,12 @@ def block_shares(distances: Sequence[float], newest_share: float) -> np.ndarray:
 class AdaptedBranches(BranchSource):
     """Branches that start more often where policies like the present one have been."""
 
-    def target_rows(self, model: RelativeUpdate, n: int) -> np.ndarray:
+    def target_rows(self, agent: Agent, n: int) -> np.ndarray:
         """Rows of D_target, drawn by :meth:`PDML.row_weights`."""
-        assert isinstance(model, PDML)
-        side = model.replay_buffer.target
+        assert isinstance(agent, PDML)
+        side = agent.replay_buffer.target
         size = side.size()
-        chosen = np.random.choice(size, size=n, p=model.row_weights(size))
+        chosen = np.random.choice(size, size=n, p=agent.row_weights(size))
         return (chosen + side.pos) % size if side.full else chosen
 
 
@@ -96,12 +96,12 @@ class PDML(MBPO):
         #: whole blocks, oldest first; what each weighs now; target steps since the last of them ended
         self.blocks: list[Block] = []
         self.shares = np.ones(1)
-        self._since_block = 0
+        self.steps_since_block = 0
         super().__init__(*args, **kwargs)
 
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        if "target_data" in self._passed:
+    def _check_arguments(self, offline: bool) -> None:
+        super()._check_arguments(offline)
+        if "target_data" in self.given_arguments:
             raise ValueError("target_data: PDML weighs blocks by the policies that collected them; pass target_env")
         if self.use_sde:
             raise NotImplementedError("use_sde=True: PDML compares Gaussian policies; leave it out")
@@ -115,31 +115,32 @@ class PDML(MBPO):
         replaced = self.target_env is not None
         super().set_target_env(env)
         if replaced:
-            self.blocks, self.shares, self._since_block = [], np.ones(1), 0
+            self.blocks, self.shares, self.steps_since_block = [], np.ones(1), 0
 
-    def _make_source_world(self) -> SourceWorld:
+    def make_rollouts(self) -> SourceRollouts:
+        """Branches that start where policies like the present one have been."""
         assert self.dynamics is not None  # it updates them
         return AdaptedBranches(self.dynamics, self.rollout_start)
 
-    def _count_for_fit(self) -> None:
-        super()._count_for_fit()
-        self._since_block += self._collected
+    def _close_round(self) -> None:
+        super()._close_round()
+        self.steps_since_block += self.state.rollout_timesteps
 
-    def fit_dynamics(self) -> None:
+    def update_dynamics(self) -> None:
         """End a block where one is full, then fit as MBPO does."""
-        if self._since_block >= self.block_steps:
+        if self.steps_since_block >= self.block_steps:
             actor = {name: value.detach().cpu().clone() for name, value in self.actor.state_dict().items()}
-            self.blocks.append(Block(self._since_block, actor))
-            self._since_block = 0
+            self.blocks.append(Block(self.steps_since_block, actor))
+            self.steps_since_block = 0
             self.shares = block_shares([self.distance(block) for block in self.blocks[:-1]], self.newest_share)
             self.logger.record("dynamics/newest_share", float(self.shares[-1]))
-        super().fit_dynamics()
+        super().update_dynamics()
 
     @th.no_grad()
     def distance(self, block: Block) -> float:
         """Mean distance of the present policy to the one at a block's end, over states of D_target."""
         self.actor.set_training_mode(False)  # after updates: dropout and batch statistics would join in
-        seen = self._normalised(self.transitions("target").take(slice(-STATES, None)).observations)
+        seen = self.normalise_observations(self.transitions("target").take(slice(-STATES, None)).observations)
         present = {name: value.clone() for name, value in self.actor.state_dict().items()}
         mean, log_std, _ = self.actor.get_action_dist_params(seen)
         try:
@@ -160,7 +161,7 @@ class PDML(MBPO):
             return np.full(size, 1.0 / size)
         sizes = np.array([block.size for block in self.blocks])
         each = np.repeat(self.shares / sizes, sizes)
-        weights = np.append(each, np.full(self._since_block, each[-1]))
+        weights = np.append(each, np.full(self.steps_since_block, each[-1]))
         weights = np.pad(weights, (max(0, size - len(weights)), 0), mode="edge")[-size:]
         return weights / weights.sum()
 

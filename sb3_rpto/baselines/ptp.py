@@ -9,8 +9,8 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
-from sb3_rpto.algorithms.rollouts import BranchSource, SourceWorld, sample_policy
-from sb3_rpto.algorithms.update import RelativeUpdate
+from sb3_rpto.algorithms.interfaces import Agent, SourceRollouts
+from sb3_rpto.algorithms.rollouts import BranchSource, sample_policy
 from sb3_rpto.baselines.mbpo import MBPO
 from sb3_rpto.baselines.regression import regress
 from sb3_rpto.dynamics.base import Prediction, Transitions
@@ -120,19 +120,19 @@ def _inputs(observations: th.Tensor, actions: th.Tensor, predicted: Prediction) 
 class ForeseenBranches(BranchSource):
     """Branches whose answer is the best of several; a plain sample until the error network has been fitted."""
 
-    def answer(self, model: RelativeUpdate, observations: th.Tensor, actions: th.Tensor) -> Prediction:
+    def answer(self, agent: Agent, observations: th.Tensor, actions: th.Tensor) -> Prediction:
         """See :func:`foresee`."""
-        assert isinstance(model, PTP)
-        if not model.errors.fitted:
-            return super().answer(model, observations, actions)
+        assert isinstance(agent, PTP)
+        if not agent.errors.fitted:
+            return super().answer(agent, observations, actions)
         return foresee(
             self.dynamics.step,
-            model.act,
-            model.errors,
+            agent.act,
+            agent.errors,
             observations,
             actions,
-            model.n_candidates,
-            model.horizon,
+            agent.n_candidates,
+            agent.horizon,
         )
 
 
@@ -170,7 +170,7 @@ class PTP(MBPO):
         **kwargs: Any,
     ) -> None:
         if n_candidates is None:
-            self._passed -= {"n_candidates"}
+            self.given_arguments -= {"n_candidates"}
         self.n_candidates = self.NUMBERS["n_candidates"] if n_candidates is None else n_candidates
         self.horizon, self.beta, self.error_steps = horizon, beta, error_steps
         super().__init__(*args, **kwargs)
@@ -183,16 +183,18 @@ class PTP(MBPO):
         super()._setup_model()
         self.errors = ErrorNetwork(self.observation_space.shape[0], self.action_space.shape[0]).to(self.device)
 
-    def _make_source_world(self) -> SourceWorld:
+    def make_rollouts(self) -> SourceRollouts:
+        """Branches whose answer is the best of several."""
         assert self.dynamics is not None  # it updates them
         return ForeseenBranches(self.dynamics, self.rollout_start)
 
     def act(self, observations: th.Tensor) -> th.Tensor:
         """Actions of the stochastic policy in the environment's units; raw observations (n, d) -> (n, action_dim)."""
-        return self.unscale_actions(sample_policy(self, self._normalised(observations)))
+        return self.unscale_actions(sample_policy(self, self.normalise_observations(observations)))
 
-    def _fit_to_transitions(self) -> None:
-        super()._fit_to_transitions()
+    def fit_dynamics(self) -> None:
+        """Fit the model as MBPO does, then the error network to what it still errs by."""
+        super().fit_dynamics()
         assert self.dynamics is not None
         data = self.transitions("target")
         predicted = self.dynamics.step(data.observations, data.actions)
@@ -200,8 +202,9 @@ class PTP(MBPO):
         self.logger.record("dynamics/mean_squared_error", float(errors.mean()))
         self.logger.record("dynamics/error_network_loss", self.errors.fit(data, predicted, errors, self.error_steps))
 
-    def _own_states(self) -> list[str]:
-        return [*super()._own_states(), "errors", "errors.optimizer"]
+    def own_states(self) -> list[str]:
+        """Those of all, and the error network with its optimizer."""
+        return [*super().own_states(), "errors", "errors.optimizer"]
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "errors"]

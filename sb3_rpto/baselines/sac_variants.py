@@ -15,12 +15,12 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_rpto.algorithms import warm_start
+from sb3_rpto.algorithms import pretraining
 from sb3_rpto.algorithms.arguments import begin_temperature, one_kind_of_temperature
+from sb3_rpto.algorithms.environment_checks import check_spaces
 from sb3_rpto.algorithms.plain_sac import carried_arguments
-from sb3_rpto.algorithms.rollouts import EpisodeSource, make_source_world
-from sb3_rpto.algorithms.target import check_spaces
-from sb3_rpto.algorithms.update import as_transitions
+from sb3_rpto.algorithms.recorded_data import as_transitions
+from sb3_rpto.algorithms.rollouts import EpisodeSource, make_rollouts
 from sb3_rpto.baselines.policy_distillation import SquashedMeanPolicy, clone, clone_kwargs
 from sb3_rpto.baselines.regression import regress
 from sb3_rpto.buffers import DualReplayBuffer, World, chronological, load_transitions
@@ -106,10 +106,10 @@ def source_transitions(
     """
     if source_data is not None:
         return load_transitions(source_data), 0
-    settings: dict[str, Any] = {"gradient_steps": 0, "buffer_size": warm_start.PHI_0_STEPS}
-    recorder = fine_tuned_sac(source_model, source, seed, **settings).learn(warm_start.PHI_0_STEPS)
+    settings: dict[str, Any] = {"gradient_steps": 0, "buffer_size": pretraining.PHI_0_STEPS}
+    recorder = fine_tuned_sac(source_model, source, seed, **settings).learn(pretraining.PHI_0_STEPS)
     assert recorder.replay_buffer is not None  # learn() has filled it
-    return chronological(recorder.replay_buffer), warm_start.PHI_0_STEPS
+    return chronological(recorder.replay_buffer), pretraining.PHI_0_STEPS
 
 
 # ---------------------------------------------------------------------- many updates
@@ -334,6 +334,6 @@ def identified_source(
     dynamics = unfitted_source(source, declared, dynamics_kwargs)
     dynamics.seed(seed)
     dynamics.fit(as_transitions(chronological(recorded), recorder.policy, recorder.device), max_steps=max_steps)
-    world = make_source_world(source, dynamics, "source", 1)
+    world = make_rollouts(source, dynamics, "source", 1)
     assert isinstance(world, EpisodeSource)  # physical models are rolled out in whole episodes
     return world.env, dynamics.describe()

@@ -9,7 +9,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_rpto.algorithms.target import share_normalisation
+from sb3_rpto.algorithms.normalisation import share_normalisation
 from sb3_rpto.baselines.mbpo import MBPO
 from sb3_rpto.baselines.policy_distillation import SquashedMeanPolicy, clone, clone_kwargs
 from sb3_rpto.baselines.slbo_dynamics import DeterministicDynamics
@@ -109,17 +109,18 @@ class SLBO(MBPO):
         self.trpo._setup_model()
         self.trpo.set_logger(Logger(None, []))
 
-    def _make_dynamics(self, config: dict[str, Any]) -> Dynamics:
+    def make_dynamics(self, config: dict[str, Any]) -> Dynamics:
+        """The deterministic model that SLBO trains along its own predictions."""
         settings = {name: value for name, value in config.items() if name != "backend"}
         return DeterministicDynamics(self.observation_space, self.action_space, **settings)
 
     # ------------------------------------------------------------------ the policy is TRPO's
 
-    def begin_in_source(self, source_timesteps: int, progress_bar: bool) -> None:
+    def prepare_in_source(self, source_timesteps: int, progress_bar: bool) -> None:
         """As for all, then clone the policy."""
-        super().begin_in_source(source_timesteps, progress_bar)
+        super().prepare_in_source(source_timesteps, progress_bar)
         if not self._cloned:
-            states = self._normalised(self.transitions("source").observations).cpu().numpy()
+            states = self.normalise_observations(self.transitions("source").observations).cpu().numpy()
             for name, value in clone(self.trpo.policy, self, states).items():
                 self.logger.record(f"slbo/{name}", value)
             self._cloned = True
@@ -150,17 +151,20 @@ class SLBO(MBPO):
 
     # ------------------------------------------------------------------ the loop
 
-    def interact_with_source(self) -> None:
-        """Nothing: TRPO makes its own rollouts, in :meth:`update`."""
+    def collect_source(self) -> None:
+        """Nothing: TRPO makes its own rollouts, in :meth:`update_dynamics`."""
 
-    def update(self) -> None:
+    def update_policy(self) -> None:
+        """Nothing but to count the round: TRPO learns in a stage of :meth:`update_dynamics`."""
+        self._close_round()
+
+    def update_dynamics(self) -> None:
         """A stage every ``model_train_freq`` target steps."""
-        self._count_for_fit()
-        if self._since_fit < self.model_train_freq or self.replay_buffer.size() < 2:
+        if self.state.steps_since_fit < self.model_train_freq or self.replay_buffer.size() < 2:
             return
         assert self.dynamics is not None
         assert self.env is not None  # learn() has checked
-        self._adopt_target_rules()
+        self.adopt_target_rules()
         data = self.transitions("target")
         self.logger.record("dynamics/error_before", self.dynamics.error(data))
         rollouts = DynamicsVecEnv(self.dynamics, self.env, self.trpo.n_envs, self.rollout_length)
@@ -172,14 +176,14 @@ class SLBO(MBPO):
                 self.trpo.learn(self.rollout_samples, log_interval=2)  # never: it has one iteration
                 self.source_timesteps += self.rollout_samples
             self._iterations_done += 1
-        self._iterations_done = self._since_fit = 0
+        self._iterations_done = self.state.steps_since_fit = 0
         self._n_updates += self.iterations * self.policy_updates
         for name, value in log.items():
             self.logger.record(f"dynamics/{name}", value)
         for name in ("policy_objective", "value_loss", "kl_divergence_loss", "std"):
             self.logger.record(f"slbo/{name}", self.trpo.logger.name_to_value[f"train/{name}"])
         self.logger.record("dynamics/error", self.dynamics.error(data))
-        if self._offline:  # as in fit_dynamics()
+        if self.target_env is None:  # as for all
             self.dump_logs()
 
     def to_sac(self) -> SAC:

@@ -26,7 +26,10 @@ and result.json. Recordings: docs/measurements.md. The whole way: docs/robot-log
 
 #: What the command gives itself.
 GIVEN = frozenset(
-    {"self", "policy", "env", "target_env", "target_data", "dynamics", "declared", "close_loop", "seed", "device"}
+    {
+        *("self", "policy", "env", "target_env", "target_data", "dynamics", "declared", "close_loop", "effects"),
+        *("seed", "device"),
+    }
 )
 
 
@@ -117,7 +120,8 @@ def run(parsed: argparse.Namespace) -> int:
             target_data=data,
             dynamics="physical",
             declared=declared,
-            close_loop=parsed.candidates or True,
+            close_loop=True,
+            effects=parsed.candidates or "all",
             seed=parsed.seed,
             device=parsed.device,
             vec_normalize=statistics,

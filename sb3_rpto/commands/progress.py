@@ -15,7 +15,7 @@ from sb3_rpto.commands.terminal import say
 from sb3_rpto.files import write_text
 
 if TYPE_CHECKING:
-    from sb3_rpto.algorithms.closed_loop.controller import LoopCloser
+    from sb3_rpto.algorithms.closed_loop.controller import ClosedLoop
 
 #: Rows of a run; a checkpoint with each but the last.
 COUNT = 8
@@ -65,9 +65,9 @@ class Progress(BaseCallback):
         self.rows.append(
             {
                 "steps": self.num_timesteps,
-                "updates": model._n_updates,
+                "updates": model.n_updates,
                 "seconds": round(self._before + time.perf_counter() - self._since, 2),
-                "simulated_return": float(model.loop.rehearsals.best) if model.loop.accounts else None,
+                "simulated_return": float(model.loop.selection.best) if model.loop.simulator_validated else None,
             }
         )
         if not self.quiet:
@@ -86,8 +86,8 @@ def read_rows(checkpoint: Path) -> list[dict[str, Any]]:
     return json.loads((checkpoint / CURVE).read_text(encoding="utf-8"))["rows"]
 
 
-def earnings(loop: LoopCloser) -> str:
+def earnings(loop: ClosedLoop) -> str:
     """What the best policy so far earns, where anything tells."""
-    if not loop.accounts:
+    if not loop.simulator_validated:
         return "the simulator does not account for the log, so nothing tells what the policy is worth"
-    return f"return {loop.rehearsals.best:.1f} in the corrected simulator"
+    return f"return {loop.selection.best:.1f} in the corrected simulator"

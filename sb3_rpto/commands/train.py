@@ -44,7 +44,7 @@ def run(parsed: argparse.Namespace) -> int:
     from stable_baselines3 import SAC
 
     from sb3_rpto.algorithms.arguments import constructor_names
-    from sb3_rpto.algorithms.target import check_spaces
+    from sb3_rpto.algorithms.environment_checks import check_spaces
     from sb3_rpto.commands.runs import RunFolder, SavedCurve, load_checkpoint
     from sb3_rpto.files import write_atomically
     from sb3_rpto.zoo.settings import shipped_settings

@@ -94,7 +94,7 @@ def run(parsed: argparse.Namespace) -> int:
     learns_anew = parsed.method == "sac"
     statistics = None if learns_anew else statistics_of_source(parsed.source_model, parsed.vec_normalize)
     _check_worlds(parsed, source, target, statistics)
-    if settings.get("close_loop", False) is not False:  # an empty list traces, too
+    if settings.get("close_loop"):
         figures.require()
         recordings.check_out(parsed.out, source.make())
     every = parsed.every or max(steps // 10, 1)

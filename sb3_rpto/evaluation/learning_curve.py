@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_rpto.algorithms.target import share_normalisation
+from sb3_rpto.algorithms.normalisation import share_normalisation
 
 MakeEnv = Callable[[], gym.Env]
 #: Evaluation environments are seeded apart from both worlds.

@@ -26,10 +26,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
+from sb3_rpto.algorithms.checkpointing import TARGET_SEED_OFFSET
 from sb3_rpto.algorithms.plain_sac import carried_arguments
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.algorithms.transition_checks import NotFiniteError
-from sb3_rpto.algorithms.two_env_sac import TARGET_SEED_OFFSET
 from sb3_rpto.algorithms.warm_start import check_source_spaces, load_sac
 from sb3_rpto.zoo.samplers import SAMPLERS
 from sb3_rpto.zoo.settings import ALGORITHMS, section, settings_beside, shipped_file, source_of, target_beside

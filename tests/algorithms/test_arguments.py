@@ -19,6 +19,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms import argument_ranges, arguments
+from sb3_rpto.algorithms.target import OfflineTarget
 from sb3_rpto.effects import LIBRARY, declare
 
 
@@ -195,12 +196,12 @@ def test_arguments_without_use_are_named():
 
 @pytest.mark.parametrize(
     ("kinds", "error", "message"),
-    [(["coulomb"], ValueError, "close_loop.*coulomb_friction"), ("coulomb_friction", TypeError, "close_loop must be")],
+    [(["coulomb"], ValueError, "effects.*coulomb_friction"), ("coulomb_friction", TypeError, "effects must be")],
 )
 def test_effects_to_look_for_are_checked_at_once(kinds, error, message):
     env, target = (gym.make("InvertedDoublePendulum-v5") for _ in range(2))
     with pytest.raises(error, match=message):
-        small(RPTO, env, target, dynamics="physical", dynamics_kwargs={}, close_loop=kinds)
+        small(RPTO, env, target, dynamics="physical", dynamics_kwargs={}, close_loop=True, effects=kinds)
 
 
 @pytest.mark.parametrize("rule", ["reward_fn", "termination_fn"])
@@ -266,10 +267,10 @@ def test_whole_episodes_have_no_branches_to_start():
         physical(declared=["pole.length"], rollout_start="target", dynamics_kwargs={})
 
 
-@pytest.mark.parametrize("close_loop", [False, ["spring"]])
-def test_effects_that_are_known_are_trained(close_loop):
+@pytest.mark.parametrize("closed", [{}, {"close_loop": True, "effects": ["spring"]}])
+def test_effects_that_are_known_are_trained(closed):
     given = {"effects": [LIBRARY["command_delay"]("slide", delay=0.03).to_json()]}
-    made = physical(close_loop=close_loop, dynamics_kwargs=given)
+    made = physical(dynamics_kwargs=given, **closed)
     assert made.dynamics.names == ["command_delay(slide).delay"]
 
 
@@ -288,8 +289,10 @@ def test_effects_need_not_be_plain_data():
         (ValueError, {"dynamics_kwargs": {"effects": [{"kind": "command_delay"}]}}, "it lacks on, values"),
         (ValueError, {"dynamics_kwargs": {"max_steps": 2.5}}, "max_steps must be a positive integer"),
         (ValueError, {"dynamics_kwargs": {"threads": -1}}, "threads must be a number of threads from 1"),
-        (TypeError, {"close_loop": None}, "close_loop must be True, False or a list"),
-        (TypeError, {"close_loop": 1}, "close_loop must be True, False or a list"),
+        (ValueError, {"close_loop": None}, "close_loop must be True or False"),
+        (ValueError, {"close_loop": ["spring"]}, "close_loop must be True or False .*effects="),
+        (TypeError, {"close_loop": True, "effects": None}, 'effects must be "all" or a list of kinds'),
+        (ValueError, {"declared": ["pole.length"], "effects": ["spring"]}, "pass close_loop=True, too"),
     ],
 )
 def test_wrong_settings_of_a_simulator_are_refused_at_once(error, kwargs, said):
@@ -329,7 +332,7 @@ def test_what_load_changes_is_looked_at_as_well(kwargs, said, tmp_path):
 def test_known_effects_that_a_trace_would_refuse_are_refused_before_the_first_step(effects, said):
     given = {"effects": [effect.to_json() for effect in effects]}
     with pytest.raises(ValueError, match=said):
-        physical(close_loop=["spring"], declared=["hinge.damping"], dynamics_kwargs=given)
+        physical(close_loop=True, effects=["spring"], declared=["hinge.damping"], dynamics_kwargs=given)
 
 
 @pytest.mark.parametrize("wrapper", [gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward])
@@ -358,9 +361,9 @@ def test_a_budget_that_ends_before_the_first_fit_is_told():
 
 
 def test_a_budget_that_ends_before_the_first_trace_is_told_before_that_of_the_fit():
-    model = physical(close_loop=["spring"], declared=["hinge.damping"])
+    model = physical(close_loop=True, effects=["spring"], declared=["hinge.damping"])
     with pytest.warns(UserWarning, match="ends before the closed loop's first trace, for which it waits 2.. target"):
-        arguments._warn_of_little(model, 20)
+        arguments.warn_of_little(model, 20)
 
 
 @pytest.mark.parametrize(
@@ -404,17 +407,17 @@ def test_a_source_model_that_is_not_there_is_named():
 
 def test_next_to_no_updates_offline_are_told():
     model = small(RPTO, source_steps=400, gradient_steps=5)
-    model._offline = True
+    model.target = OfflineTarget()
     told = r"3 rounds of 400 \(source_steps=400\) with 5 updates each by gradient_steps=5, 15 in all"
     with pytest.warns(UserWarning, match=told):
-        arguments._warn_of_little(model, 1_200)
+        arguments.warn_of_little(model, 1_200)
     model.gradient_steps = -1
     with pytest.warns(UserWarning, match="with 1 updates each by gradient_steps=-1, 3 in all"):
-        arguments._warn_of_little(model, 1_200)
+        arguments.warn_of_little(model, 1_200)
     model.gradient_steps = 0  # nobody asked for any
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        arguments._warn_of_little(model, 1_200)
+        arguments.warn_of_little(model, 1_200)
 
 
 @pytest.mark.parametrize(("agent", "error"), [(PPO, TypeError), (TD3, TypeError)])

@@ -10,7 +10,7 @@ import torch as th
 from conftest import pendulum
 
 from sb3_rpto import RPO, RPTO
-from sb3_rpto.algorithms.update import RelativeUpdate
+from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.dynamics.ensemble import EnsembleDynamics, _Examples
 
 BATCH = 32
@@ -46,7 +46,7 @@ def made(monkeypatch):
         for world in ("source", "target"):
             model.replay_buffer.append(world, **rows(300, model))
         model._setup_learn(1)
-        model._pretraining = False
+        model.state.pretraining = False
         return model
 
     return make
@@ -83,14 +83,14 @@ def test_a_burst_reads_its_losses_at_the_end_and_nothing_else(cls, kwargs, losse
 
 
 def test_reading_within_a_burst_would_be_noticed(made, reads, monkeypatch):
-    model, loss = made(RPO), RelativeUpdate.critic_loss
+    model, loss = made(RPO), TransferAlgorithm.critic_loss
     monkeypatch.setattr(RPO, "critic_loss", lambda self, *given: loss(self, *given) * float(self.temperature()))
     with pytest.raises(RuntimeError, match="meta"):
         model.train(2, BATCH)
 
 
 def test_a_tensor_of_another_device_would_be_noticed(made, reads, monkeypatch):
-    model, loss = made(RPO), RelativeUpdate.critic_loss
+    model, loss = made(RPO), TransferAlgorithm.critic_loss
     monkeypatch.setattr(RPO, "critic_loss", lambda self, *given: loss(self, *given) + th.ones(BATCH).mean(0, True))
     with pytest.raises(RuntimeError, match="device"):
         model.train(2, BATCH)

@@ -27,7 +27,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_get
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms import checkpointing, two_env_sac, warm_start
+from sb3_rpto.algorithms import pretraining, rto
 from sb3_rpto.algorithms.rollouts import EpisodeSource
 from sb3_rpto.baselines.mbpo import MBPO
 from sb3_rpto.baselines.pdml import PDML
@@ -44,7 +44,7 @@ from sb3_rpto.envs.task_rules import task_rules
 
 def states(model):
     """Of all modules and optimizers."""
-    own = {name: recursive_getattr(model, name).state_dict() for name in model._own_states()}
+    own = {name: recursive_getattr(model, name).state_dict() for name in model.own_states()}
     return {**model.get_parameters(), **own}
 
 
@@ -59,7 +59,8 @@ def assert_same(a, b):
         ours, theirs = (chronological(model.replay_buffer.side(world)) for model in (a, b))
         for name in ours:
             np.testing.assert_array_equal(ours[name], theirs[name], err_msg=f"{world} {name}")
-    for counter in ("num_timesteps", "source_timesteps", "_n_updates", "_actor_updates", "_since_fit", "_episode_num"):
+    assert a.state == b.state
+    for counter in ("num_timesteps", "_n_updates", "_episode_num"):
         assert getattr(a, counter) == getattr(b, counter), counter
     assert a.temperature() == b.temperature()
 
@@ -180,7 +181,7 @@ def test_a_save_that_is_interrupted_leaves_the_model_as_it_was(tmp_path, monkeyp
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(checkpointing, "_picklable", interrupted)
+        patched.setattr(rto, "picklable", interrupted)
         with pytest.raises(KeyboardInterrupt):
             model.save(tmp_path / "model")
     model.learn(20, reset_num_timesteps=False)
@@ -341,7 +342,7 @@ def test_an_untrained_model_is_still_untrained_after_loading(tmp_path):
     model.save(tmp_path / "fresh.zip")
     loaded = RPO.load(tmp_path / "fresh.zip", env=pendulum(), target_env=pendulum(12.0))
     loaded.learn(5, source_timesteps=60)
-    assert loaded._pretrained_steps == 60
+    assert loaded.state.pretraining_timesteps == 60
 
 
 def test_a_killed_source_phase_goes_on_from_its_checkpoint(tmp_path):
@@ -362,11 +363,11 @@ def test_a_killed_source_phase_goes_on_from_its_checkpoint(tmp_path):
         model.learn(5, source_timesteps=300)
     resumed = RPO.load(tmp_path / "pretrain.zip", env=pendulum(), target_env=pendulum(12.0))
     resumed.load_replay_buffer(tmp_path / "pretrain_replay_buffer.pkl")
-    done = resumed._pretrained_steps
+    done = resumed.state.pretraining_timesteps
     assert 0 < done < 300
     assert resumed.replay_buffer.source.size() == done
     resumed.learn(5, source_timesteps=300)
-    assert resumed._pretrained_steps == 300
+    assert resumed.state.pretraining_timesteps == 300
     forgetful = RPO.load(tmp_path / "pretrain.zip", env=pendulum(), target_env=pendulum(12.0))
     held, train = [], forgetful.train
     forgetful.train = lambda *args: held.append(forgetful.replay_buffer.source.size()) or train(*args)
@@ -435,7 +436,7 @@ def test_a_randomised_simulator_draws_anew_for_a_new_seed(tmp_path):
         loaded = cls.load(tmp_path / "m", source(), target_env=target(), **seed)
         loaded.load_replay_buffer(tmp_path / "m.pkl")
         loaded.learn(1, reset_num_timesteps=False)
-        return loaded._source_world._rng.random()
+        return loaded.rollouts._rng.random()
 
     assert drawn() == drawn()
     assert len({drawn(), drawn(seed=1), drawn(seed=2)}) == 3
@@ -664,14 +665,14 @@ def test_a_source_phase_goes_on_with_its_statistics(tmp_path, monkeypatch):
 
     model = small(RPO, source())
     model.set_logger(configure(str(tmp_path), []))
-    train = warm_start._train_in_source
-    monkeypatch.setattr(warm_start, "_train_in_source", lambda model, steps, bar: train(model, steps // 2, bar))
+    train = pretraining.train_in_source
+    monkeypatch.setattr(pretraining, "train_in_source", lambda model, steps, bar: train(model, steps // 2, bar))
     model.learn(5, source_timesteps=300)
     counted = model.env.obs_rms.count
     monkeypatch.undo()
     resumed = RPO.load(tmp_path / "pretrain.zip", env=source(), target_env=pendulum(12.0))
     resumed.load_replay_buffer(tmp_path / "pretrain_replay_buffer.pkl")
-    assert resumed._pretrained_steps == 150
+    assert resumed.state.pretraining_timesteps == 150
     resumed.learn(5, source_timesteps=300)
     assert resumed.env.obs_rms.count > counted + 140
 
@@ -697,8 +698,8 @@ def test_statistics_come_back_where_the_state_of_their_world_is_unknown(tmp_path
 def test_a_source_phase_over_an_unknown_world_goes_on_with_its_statistics(tmp_path, monkeypatch):
     model = small(RPO, normalised_unknown())
     model.set_logger(configure(str(tmp_path), []))
-    train = warm_start._train_in_source
-    monkeypatch.setattr(warm_start, "_train_in_source", lambda model, steps, bar: train(model, steps // 2, bar))
+    train = pretraining.train_in_source
+    monkeypatch.setattr(pretraining, "train_in_source", lambda model, steps, bar: train(model, steps // 2, bar))
     model.learn(5, source_timesteps=300)
     counted = model.env.obs_rms.count
     monkeypatch.undo()
@@ -894,7 +895,7 @@ def test_a_folder_is_no_place_for_a_model(tmp_path):
 
 @pytest.mark.parametrize(("passed", "steps"), [({"max_steps": 7}, 7), ({}, 40)])
 def test_the_users_max_steps_bound_the_first_fit_too(passed, steps, monkeypatch):
-    monkeypatch.setattr(warm_start, "PHI_0_UPDATES", 40)
+    monkeypatch.setattr(pretraining, "PHI_0_UPDATES", 40)
     fitted = []
     fit = EnsembleDynamics.fit
     monkeypatch.setattr(
@@ -923,7 +924,7 @@ def test_from_source_takes_everything_over(tmp_path):
         ours, theirs = model.actor.optimizer.state_dict()["state"], sac.actor.optimizer.state_dict()["state"]
         assert all(th.equal(ours[i]["exp_avg"], theirs[i]["exp_avg"]) for i in theirs)
     model.learn(3)
-    assert model._pretrained_steps == 0
+    assert model.state.pretraining_timesteps == 0
 
 
 @pytest.mark.parametrize("form", ["npz", "buffer", "pickle"])
@@ -1051,7 +1052,7 @@ def test_a_source_phases_checkpoint_is_not_in_the_source_phase_once_loaded(tmp_p
     loaded.load_replay_buffer(tmp_path / "pretrain_replay_buffer.pkl")
     before = [p.clone() for p in loaded.actor.parameters()]
     loaded.learn(10, source_timesteps=0)
-    assert not loaded._pretraining
+    assert not loaded.state.pretraining
     assert all(th.equal(a, b) for a, b in zip(before, loaded.actor.parameters()))  # RTO leaves the policy
 
 
@@ -1060,7 +1061,7 @@ def test_a_warm_start_after_loading_is_saved(tmp_path):
     model = RPO.load(tmp_path / "cold")
     model.set_parameters(model.get_parameters())
     model.save(tmp_path / "warm")
-    assert RPO.load(tmp_path / "warm")._warm
+    assert RPO.load(tmp_path / "warm").state.knows_source
 
 
 class WithDriver(gym.Wrapper):
@@ -1098,7 +1099,7 @@ def test_rules_of_environments_that_do_not_pickle_are_read_again_after_loading(t
 
 def test_rules_are_read_once_of_each_target(monkeypatch):
     read: list[object] = []
-    monkeypatch.setattr(two_env_sac, "task_rules", lambda env: read.append(env) or task_rules(env))
+    monkeypatch.setattr(rto, "task_rules", lambda env: read.append(env) or task_rules(env))
     model = small(RPTO, WithDriver(pendulum()), WithDriver(pendulum(12.0), 2.0), model_train_freq=10)
     read.clear()
     model.learn(30, source_timesteps=0)
@@ -1130,7 +1131,7 @@ def test_another_target_begins_without_the_data_and_the_best_policy_of_the_last(
     with pytest.warns(UserWarning, match="loses 500 transitions"):
         model.set_target_env(pendulum(14.0))
     assert model.replay_buffer.target.size() == 0
-    assert (model.best_mean_reward, "best" in model.snapshots) == (-np.inf, False)
+    assert (model.snapshots.best_mean_reward, "best" in model.snapshots) == (-np.inf, False)
 
 
 def test_action_noise_survives_a_refused_run():
@@ -1145,11 +1146,11 @@ def test_what_refills_the_source_of_a_corrected_simulator_is_that_simulator(tmp_
     model = small(RPTO, cartpole(), cartpole(pole_length=2.0), dynamics="physical", dynamics_kwargs={})
     model.save(tmp_path / "m")
     loaded = RPTO.load(tmp_path / "m", env=cartpole(), target_env=cartpole(pole_length=2.0))
-    loaded._source_world = loaded._make_source_world()
+    loaded.rollouts = loaded.make_rollouts()
     seen = []
     monkeypatch.setattr(EpisodeSource, "interact", lambda world, *a, **k: seen.append(world.env) or 0)
-    warm_start._collect_in_source(loaded, 10)
-    assert seen == [loaded._source_world.env]
+    pretraining.collect_in_source(loaded, 10)
+    assert seen == [loaded.rollouts.env]
     assert seen != [loaded.env]
 
 
@@ -1165,7 +1166,7 @@ def test_parameters_set_by_hand_count_as_a_warm_start():
     model = small(RPO)
     model.set_parameters(sac.get_parameters())
     model.learn(3)
-    assert model._pretrained_steps == 0
+    assert model.state.pretraining_timesteps == 0
 
 
 def test_action_noise_belongs_to_the_target():

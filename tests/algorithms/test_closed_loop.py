@@ -24,12 +24,12 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPTO, RTO
-from sb3_rpto.algorithms import arguments, warm_start
-from sb3_rpto.algorithms.closed_loop import controller, retraining, source_buffer
-from sb3_rpto.algorithms.closed_loop.controller import LoopCloser, stays_finite
-from sb3_rpto.algorithms.closed_loop.policy_selection import Rehearsals
-from sb3_rpto.algorithms.closed_loop.retraining import Rounds
-from sb3_rpto.algorithms.closed_loop.source_buffer import outdated, renew_source
+from sb3_rpto.algorithms import arguments, pretraining
+from sb3_rpto.algorithms.closed_loop import acceptance, controller
+from sb3_rpto.algorithms.closed_loop.acceptance import source_buffer_is_foreign, stays_finite
+from sb3_rpto.algorithms.closed_loop.controller import ClosedLoop
+from sb3_rpto.algorithms.closed_loop.policy_selection import PolicySelection
+from sb3_rpto.algorithms.closed_loop.retraining import Retraining, reset_source_buffer
 from sb3_rpto.algorithms.rollouts import EpisodeSource
 from sb3_rpto.dynamics.physical import PhysicalDynamics
 from sb3_rpto.dynamics.weights import rto_weights
@@ -56,18 +56,25 @@ def friction() -> list[Effect]:
 
 def model(lacks: list[Effect], cls: type = RPTO, **kwargs: object) -> RPTO:
     settings: dict[str, object] = {
-        **{"dynamics": "physical", "declared": ["pole.length"], "close_loop": KINDS, "seed": 0, "device": "cpu"},
+        **{"dynamics": "physical", "declared": ["pole.length"], "close_loop": True, "effects": KINDS},
+        **{"seed": 0, "device": "cpu"},
         **{"source_steps": 4, "gradient_steps": 1, "weighting": None, "model_train_freq": 40, "batch_size": 32},
         **{"target_env": None if "target_data" in kwargs else target(lacks), "retrain_steps": 25},
         **kwargs,
     }
+    if not settings["close_loop"]:
+        del settings["effects"]
     return cls("MlpPolicy", gym.make(TASK), **settings)
+
+
+def change(patch: pytest.MonkeyPatch, **settings: float) -> None:
+    """Let closed loops have other settings."""
+    patch.setattr(ClosedLoop, "settings", replace(ClosedLoop.settings, **settings))
 
 
 @pytest.fixture
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(controller, "FIRST", 80)
-    monkeypatch.setattr(source_buffer, "FILL", 25)
+    change(monkeypatch, first_trace=80, fill_steps=25)
 
 
 #: Reports that :func:`learned` was told of, and how many updates it had made by then.
@@ -77,10 +84,8 @@ TOLD: list[tuple[Report, int]] = []
 @cache
 def learned() -> RPTO:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(controller, "FIRST", 80)
-        patch.setattr(source_buffer, "FILL", 25)
+        change(patch, first_trace=80, fill_steps=25)
         made = model(friction())
-        assert made.loop is not None
         made.loop.on_report = lambda report: TOLD.append((report, made._n_updates))
         return made.learn(100, source_timesteps=100)
 
@@ -91,8 +96,8 @@ def kept_on_a_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("log")
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(source_buffer, "FILL", 25)
-        patch.setattr(warm_start, "FIRST_SOURCE_STEPS", 200)
+        change(patch, fill_steps=25)
+        patch.setattr(pretraining, "FIRST_SOURCE_STEPS", 200)
         made = model([], target_data=measured, close_loop=False, model_train_freq=20).learn(40, source_timesteps=0)
     made.save(folder / "model")
     made.save_replay_buffer(folder / "buffer")
@@ -112,7 +117,6 @@ def dynamics(made: RPTO) -> PhysicalDynamics:
 
 def test_an_undeclared_effect_is_named_added_and_fitted() -> None:
     made = learned()
-    assert made.loop is not None
     report: Report = made.loop.reports[0]
     assert report.verdict == "explained"
     assert [traced.effect.label for traced in report.effects] == ["coulomb_friction(slider)"]
@@ -123,7 +127,6 @@ def test_an_undeclared_effect_is_named_added_and_fitted() -> None:
 
 def test_a_report_is_told_before_the_policy_learns_in_what_it_corrects() -> None:
     made = learned()
-    assert made.loop is not None
     ((report, updates),) = TOLD
     assert report is made.loop.reports[0]
     owed = 100 - 80  # updates that the last target steps pay for
@@ -133,11 +136,10 @@ def test_a_report_is_told_before_the_policy_learns_in_what_it_corrects() -> None
 @pytest.mark.slow
 def test_a_target_with_frictionloss_alone_is_explained(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody who sets it by hand makes it hold as a machine's does."""
-    monkeypatch.setattr(controller, "FIRST", 160)  # in fewer it turns too seldom to show that it gives way
+    change(monkeypatch, first_trace=160)  # in fewer it turns too seldom to show that it gives way
     shifted = target([])
     shifted.unwrapped.model.dof_frictionloss[0] = LEVEL  # type: ignore[attr-defined]
-    made = model([], target_env=shifted, close_loop=[*KINDS, "soft_friction"]).learn(161, source_timesteps=4)
-    assert made.loop is not None
+    made = model([], target_env=shifted, effects=[*KINDS, "soft_friction"]).learn(161, source_timesteps=4)
     report: Report = made.loop.reports[0]
     assert report.verdict == "explained"
     assert [traced.effect.label for traced in report.effects] == ["soft_friction(slider)"]
@@ -156,7 +158,7 @@ class Braked(gym.Wrapper):
 
 @pytest.mark.slow
 def test_a_target_whose_wrapper_holds_a_force_for_a_step_is_met(soon: None, tmp_path: Path) -> None:
-    made = model([], target_env=Braked(target([])), close_loop=["held_drag", "quadratic_drag"])
+    made = model([], target_env=Braked(target([])), effects=["held_drag", "quadratic_drag"])
     made.learn(81, source_timesteps=4)
     data = made.transitions("target")
     values = dynamics(made).describe()
@@ -170,7 +172,7 @@ def test_a_target_whose_wrapper_holds_a_force_for_a_step_is_met(soon: None, tmp_
 
 @pytest.mark.slow
 def test_a_target_that_queues_actions_is_met_from_the_first_step_of_an_episode_on(soon: None, tmp_path: Path) -> None:
-    made = model([], target_env=Queue(target([])), close_loop=["command_delay", "torque_offset"])
+    made = model([], target_env=Queue(target([])), effects=["command_delay", "torque_offset"])
     made.learn(81, source_timesteps=4)
     data = made.transitions("target")
     assert data.terminations.sum() > 5
@@ -185,8 +187,7 @@ def test_a_target_that_queues_actions_is_met_from_the_first_step_of_an_episode_o
 def test_a_trace_is_logged_before_any_episode_ends(soon: None, tmp_path: Path) -> None:
     made = filled([])
     made.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))
-    assert made.loop is not None
-    made.loop.close(made, dynamics(made))
+    made.loop.trace_transitions(made, dynamics(made))
     (line,) = csv.DictReader((tmp_path / "progress.csv").open())
     assert line["gap/verdict"] == "complete"
     assert line["gap/effects"] == "none"
@@ -207,11 +208,10 @@ def test_what_is_not_explained_is_said(soon: None, monkeypatch: pytest.MonkeyPat
         "trace",
         lambda *args, **kwargs: replace(trace(*args, **kwargs), verdict="unexplained", findings=steps),
     )
-    assert made.loop is not None
     said = r"on 101 target transitions is 'unexplained'.*reports\[-1\].*in its order.*with steps of 1 ms it errs less"
     said += r". declared pole.length: 0.3 is its bound$"
     with pytest.warns(UserWarning, match=said):
-        made.loop.close(made, dynamics(made))
+        made.loop.trace_transitions(made, dynamics(made))
 
 
 class Unseen(gym.Env):
@@ -235,12 +235,11 @@ class Unseen(gym.Env):
 
 
 def test_joints_in_another_order_are_found(soon: None) -> None:
-    made = model([], target_env=Unseen(), close_loop=[], retrain_steps=0)
+    made = model([], target_env=Unseen(), effects=[], retrain_steps=0)
     with pytest.warns(
         UserWarning, match="'unexplained'.*with the positions of hinge and hinge2 exchanged the model errs"
     ):
         made.learn(90, source_timesteps=0)
-    assert made.loop is not None
     (found,) = [f for f in made.loop.reports[0].findings if f.kind == FindingKind.EXCHANGED]
     assert found.where == "qpos.hinge, qpos.hinge2"
 
@@ -248,11 +247,10 @@ def test_joints_in_another_order_are_found(soon: None) -> None:
 @pytest.mark.slow
 def test_an_empty_list_traces_the_declared_numbers_alone(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     began = []
-    monkeypatch.setattr(Rounds, "learn", lambda self, made, loop: began.append(made.num_timesteps))
-    made = model(friction(), close_loop=[])
+    monkeypatch.setattr(Retraining, "learn", lambda self, made, *_: began.append(made.num_timesteps))
+    made = model(friction(), effects=[])
     with pytest.warns(UserWarning, match="unexplained"):
         made.learn(90, source_timesteps=100)
-    assert made.loop is not None
     report: Report = made.loop.reports[0]
     assert [traced.label for traced in report.declared] == ["pole.length"]
     assert not report.effects
@@ -265,9 +263,8 @@ def test_a_trace_knows_the_effects_that_were_passed(soon: None) -> None:
     late = LIBRARY["command_delay"]("slide", delay=0.1)
     passed = {"effects": [late.with_values(np.array([0.08])).to_json()]}
     made = filled([late, *friction()], 120, dynamics_kwargs=passed)
-    made.fit_dynamics()
-    assert made.loop is not None
-    made.loop.close(made, dynamics(made))
+    made.update_dynamics()
+    made.loop.trace_transitions(made, dynamics(made))
     report = made.loop.reports[-1]
     assert report.verdict == "explained"
     assert [t.label for t in report.declared] == ["pole.length", "command_delay(slide)"]
@@ -288,70 +285,65 @@ def noisy(noise: np.ndarray) -> gym.Env:
 def learned_from_noise() -> RPTO:
     noise = np.array([3e-4] * 5 + [3e-3] * 3 + [0.0])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(controller, "FIRST", 120)
-        patch.setattr(source_buffer, "FILL", 25)
+        change(patch, first_trace=120, fill_steps=25)
         passed = {"observation_noise": noise.tolist()}
-        made = model([], target_env=noisy(noise), dynamics_kwargs=passed, close_loop=["coulomb_friction"])
+        made = model([], target_env=noisy(noise), dynamics_kwargs=passed, effects=["coulomb_friction"])
         return made.learn(170, source_timesteps=180)
 
 
 @pytest.mark.slow
 def test_what_noisy_sensors_show_is_explained_all_the_same() -> None:
     made = learned_from_noise()
-    assert made.loop is not None
     (report,) = made.loop.reports
     assert report.verdict == "explained"
-    assert made.loop.accounts
+    assert made.loop.simulator_validated
     assert dynamics(made).names == ["pole.length", "coulomb_friction(slider).level"]
 
 
 @pytest.mark.slow
 def test_phi_stays_what_a_trace_found_where_sensors_are_noisy() -> None:
     made = learned_from_noise()
-    assert made.loop is not None
     (report,) = made.loop.reports
     traced = np.concatenate([t.effect.values for t in (*report.declared, *report.effects)])
-    made._since_fit = made.model_train_freq
-    made.fit_dynamics()
+    made.state.steps_since_fit = made.model_train_freq
+    made.update_dynamics()
     np.testing.assert_array_equal(dynamics(made).values, traced)
 
 
 def test_of_another_target_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    loop = LoopCloser(())
-    loop.keeps_phi = loop.stale = True
-    loop._traced_at = 100
+    loop = ClosedLoop(())
+    loop.freezes_dynamics = loop.source_buffer_stale = True
+    loop.traced_at = 100
     loop.forget_target()
-    assert not loop.keeps_phi
+    assert not loop.freezes_dynamics
     renewed: list[object] = []
-    monkeypatch.setattr(controller, "renew_source", renewed.append)
-    monkeypatch.setattr(Rounds, "learn", lambda *_: pytest.fail("it would learn for the target that was left"))
-    made: Any = SimpleNamespace(updates_policy=True, _offline=False, updates_per_step=1, snapshots={})
-    loop.renew(made)
+    monkeypatch.setattr(controller, "reset_source_buffer", lambda made, steps: renewed.append(made))
+    monkeypatch.setattr(Retraining, "learn", lambda *_: pytest.fail("it would learn for the target that was left"))
+    made: Any = SimpleNamespace(updates_policy=True, target_env=object(), updates_per_step=1, snapshots={})
+    loop.retrain(made)
     assert renewed == [made]
-    assert not loop.stale
+    assert not loop.source_buffer_stale
 
 
 @pytest.mark.slow
 def test_phi_goes_on_being_fitted_where_what_was_traced_is_refused(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     made = filled(friction(), dynamics_kwargs={"observation_noise": 1e-4})
-    assert made.loop is not None
-    monkeypatch.setattr(controller, "stays_finite", lambda *_: False)
+    monkeypatch.setattr(acceptance, "stays_finite", lambda *_: False)
     with pytest.warns(UserWarning, match="unstable: refused"):
-        made.loop.close(made, dynamics(made))
-    assert not made.loop.keeps_phi
+        made.loop.trace_transitions(made, dynamics(made))
+    assert not made.loop.freezes_dynamics
 
 
 def test_transitions_that_hold_no_window_end_no_run(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(controller, "WINDOW", 1_000)
+    change(monkeypatch, window=1_000)
     made = model([])
     with pytest.warns(UserWarning, match=r"80 target transitions were not traced: no episode holds.*twice as many"):
         made.learn(90, source_timesteps=10)
     assert made.num_timesteps == 90
-    assert made.loop is not None
     assert not made.loop.reports
-    assert not made.loop.due(made, dynamics(made))
+    assert not made.loop.trace_due(made, dynamics(made))
     append(made, [], 210)
-    assert made.loop.due(made, dynamics(made))
+    assert made.loop.trace_due(made, dynamics(made))
 
 
 @pytest.mark.slow
@@ -359,16 +351,15 @@ def test_transitions_that_were_not_traced_are_tried_again_after_a_settled_trace(
     soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = filled([])
-    assert made.loop is not None
-    made.loop.close(made, dynamics(made))
+    made.loop.trace_transitions(made, dynamics(made))
     assert made.loop.found[-1]["verdict"] == "complete"
     with monkeypatch.context() as patch:
-        patch.setattr(controller, "WINDOW", 1_000)
+        change(patch, window=1_000)
         with pytest.warns(UserWarning, match="not traced"):
-            made.loop.close(made, dynamics(made))
-    assert not made.loop.due(made, dynamics(made))
+            made.loop.trace_transitions(made, dynamics(made))
+    assert not made.loop.trace_due(made, dynamics(made))
     append(made, [], 210)
-    assert made.loop.due(made, dynamics(made))
+    assert made.loop.trace_due(made, dynamics(made))
 
 
 def test_a_late_sensor_is_taken_into_phi_by_the_reports_word() -> None:
@@ -379,10 +370,9 @@ def test_a_late_sensor_is_taken_into_phi_by_the_reports_word() -> None:
     traced = SimpleNamespace(effect=late, label=late.label)
     covariance = np.array([[0.005**2]])
     report = SimpleNamespace(declared=(), effects=(traced,), covariance=covariance, verdict="explained")
-    assert made.loop is not None
-    assert made.loop._take(made, dynamics(made), report, data, before=1e-3) == [late.label]  # type: ignore[arg-type]
+    assert made.loop.accept(made, dynamics(made), report, data, before=1e-3) == [late.label]  # type: ignore[arg-type]
     assert dynamics(made).error(data) > 1e-3
-    assert made.loop.keeps_phi
+    assert made.loop.freezes_dynamics
 
 
 def test_windows_are_as_long_as_stretches_of_known_positions() -> None:
@@ -390,26 +380,26 @@ def test_windows_are_as_long_as_stretches_of_known_positions() -> None:
         episodes = [SimpleNamespace(placed=np.array(flags, dtype=bool)) for flags in placed]
         return SimpleNamespace(exact=False, episodes=episodes)  # type: ignore[return-value]
 
-    assert controller.window(seen([1] * 20), 0.0) == controller.NOISY_WINDOW
-    assert controller.window(seen([1] * 20), 5.0) == controller.WINDOW  # where feet touch down
+    assert controller.window(seen([1] * 20), 0.0) == ClosedLoop.settings.noisy_window
+    assert controller.window(seen([1] * 20), 5.0) == ClosedLoop.settings.window  # where feet touch down
     assert controller.window(seen([1] * 5, [1] * 5, [1] * 20), 0.0) == 5
-    assert controller.window(seen([1, 0, 1, 1, 0, 1, 0] + [1] * 9), 0.0) == controller.WINDOW
-    assert controller.window(seen([0] * 9), 0.0) == controller.WINDOW
+    assert controller.window(seen([1, 0, 1, 1, 0, 1, 0] + [1] * 9), 0.0) == ClosedLoop.settings.window
+    assert controller.window(seen([0] * 9), 0.0) == ClosedLoop.settings.window
 
 
 @pytest.mark.parametrize(("noise", "traced_at", "due"), [(1e-3, 200, True), (1e-3, 400, False), (None, 200, False)])
 def test_noisy_transitions_are_traced_once_more_when_they_fill_all_windows(
     noise: float | None, traced_at: int, due: bool
 ) -> None:
-    loop = LoopCloser(())
-    loop._traced_at, loop.found, loop._error = traced_at, [{"verdict": "complete"}], 1.0
+    loop = ClosedLoop(())
+    loop.traced_at, loop.found, loop.traced_error = traced_at, [{"verdict": "complete"}], 1.0
     seen = SimpleNamespace(size=lambda: 2 * traced_at, buffer_size=10_000)
     made = SimpleNamespace(
         replay_buffer=SimpleNamespace(target=seen, target_added=2 * traced_at),
         transitions=lambda _: SimpleNamespace(take=lambda rows: rows),
     )
     phi = SimpleNamespace(observation_noise=noise, error=lambda _: 1.0)
-    assert loop.due(made, phi) is due  # type: ignore[arg-type]
+    assert loop.trace_due(made, phi) is due  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
@@ -428,15 +418,14 @@ def test_no_target_step_is_spent_on_tracing() -> None:
 
 def test_what_an_uncorrected_source_produced_is_dropped() -> None:
     made = learned()
-    assert made.loop is not None
     source = made.transitions("source")
-    assert made.source_timesteps - made.loop.rehearsals.steps - len(source) >= 100 + 80  # all from before the trace
-    assert dynamics(made).error(source) < source_buffer.OTHER
+    assert made.source_timesteps - made.loop.selection.steps - len(source) >= 100 + 80  # all from before the trace
+    assert dynamics(made).error(source) < ClosedLoop.settings.foreign_error
 
 
 def test_source_episodes_have_the_effect() -> None:
     made = learned()
-    copy = made._source_world.copies[0]  # type: ignore[union-attr]
+    copy = made.rollouts.copies[0]  # type: ignore[union-attr]
     assert "coulomb_friction(slider)" in [effect.label for effect in copy.effects]
 
 
@@ -445,7 +434,6 @@ def test_the_corrected_simulator_comes_back_from_a_checkpoint(tmp_path: Path) ->
     made.save(tmp_path / "model")
     loaded = RPTO.load(tmp_path / "model", device="cpu")
     assert dynamics(loaded).describe() == dynamics(made).describe()
-    assert loaded.loop is not None
     assert loaded.loop.found[0]["verdict"] == "explained"
 
 
@@ -453,7 +441,7 @@ def test_the_corrected_simulator_comes_back_from_a_checkpoint(tmp_path: Path) ->
 @pytest.mark.parametrize("stop", [pytest.param(60, id="before the trace"), pytest.param(90, id="after it")])
 def test_a_loop_that_was_stopped_goes_on_as_if_it_had_not_been(stop: int, soon: None, tmp_path: Path) -> None:
     def begun() -> RPTO:
-        return model(friction(), close_loop=["coulomb_friction"]).learn(stop, source_timesteps=100)
+        return model(friction(), effects=["coulomb_friction"]).learn(stop, source_timesteps=100)
 
     unbroken = begun().learn(100 - stop, reset_num_timesteps=False)
     stopped = begun()
@@ -462,8 +450,6 @@ def test_a_loop_that_was_stopped_goes_on_as_if_it_had_not_been(stop: int, soon: 
     resumed = RPTO.load(tmp_path / "model", env=gym.make(TASK), target_env=target(friction()), device="cpu")
     resumed.load_replay_buffer(tmp_path / "buffer")
     resumed.learn(100 - stop, reset_num_timesteps=False)
-    assert resumed.loop is not None
-    assert unbroken.loop is not None
     assert resumed.loop.found == unbroken.loop.found
     assert "coulomb_friction(slider).level" in dynamics(resumed).names
     np.testing.assert_array_equal(dynamics(resumed).values, dynamics(unbroken).values)
@@ -502,10 +488,14 @@ def append(made: RPTO, lacks: list[Effect], count: int) -> None:
 def test_nothing_is_added_where_nothing_is_missing(soon: None) -> None:
     made = filled([])
     dynamics(made).fit(made.transitions("target"), max_steps=30)
-    assert made.loop is not None
-    made.loop.close(made, dynamics(made))
+    made.loop.trace_transitions(made, dynamics(made))
     assert made.loop.reports[0].verdict == "complete"
     assert dynamics(made).names == ["pole.length"]
+
+
+def is_foreign(made: RPTO) -> bool:
+    """Whether another simulator made D_source."""
+    return source_buffer_is_foreign(made, dynamics(made), made.transitions("source"), ClosedLoop.settings)
 
 
 @pytest.mark.slow
@@ -513,43 +503,41 @@ def test_what_other_declared_numbers_produced_is_dropped_too(soon: None) -> None
     made = model([])
     made.learn(1, source_timesteps=60)
     append(made, [], 100)
-    assert not outdated(made, dynamics(made))
+    assert not is_foreign(made)
     dynamics(made).fit(made.transitions("target"), max_steps=30)
-    assert outdated(made, dynamics(made))
-    assert made.loop is not None
+    assert is_foreign(made)
     steps = made.source_timesteps
 
     def learned_from() -> int:
-        assert made.loop is not None
-        return made.source_timesteps - steps - made.loop.rehearsals.steps
+        return made.source_timesteps - steps - made.loop.selection.steps
 
-    made.loop.close(made, dynamics(made))
+    made.loop.trace_transitions(made, dynamics(made))
     assert learned_from() == made.replay_buffer.source.size() >= 50
-    assert not outdated(made, dynamics(made))
-    made.loop.close(made, dynamics(made))  # the source stays as it is where the simulator does
+    assert not is_foreign(made)
+    made.loop.trace_transitions(made, dynamics(made))  # the source stays as it is where the simulator does
     assert learned_from() == made.replay_buffer.source.size()
 
 
-def test_renewed_data_are_the_simulators_own_where_commands_are_late(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(source_buffer, "FILL", 1_000)
+def test_renewed_data_are_the_simulators_own_where_commands_are_late() -> None:
     late = LIBRARY["command_delay"]("slide", delay=0.05).to_json()
     made = model([], dynamics_kwargs={"effects": [late]})
     made.learn(1, source_timesteps=63)
-    renew_source(made)
-    assert not outdated(made, dynamics(made))
+    reset_source_buffer(made, 1_000)
+    assert not is_foreign(made)
 
 
 def test_data_that_have_lost_their_past_are_not_another_simulators() -> None:
     late = LIBRARY["command_delay"]("slide", delay=0.05).to_json()
     made = model([], dynamics_kwargs={"effects": [late]}, buffer_size=200)
     made.learn(1, source_timesteps=0)
-    assert made._source_world is not None
-    made._source_world.interact(made, 303)
+    assert made.rollouts is not None
+    made.rollouts.interact(made, 303)
     assert made.replay_buffer.source.full
-    assert dynamics(made).error(made.transitions("source")) > source_buffer.OTHER  # the oldest commands are gone
-    assert not outdated(made, dynamics(made))
+    error = dynamics(made).error(made.transitions("source"))
+    assert error > ClosedLoop.settings.foreign_error  # the oldest commands are gone
+    assert not is_foreign(made)
     dynamics(made).adopt([LIBRARY["coulomb_friction"]("slider", level=50.0)])
-    assert outdated(made, dynamics(made))
+    assert is_foreign(made)
 
 
 def test_weights_are_normalised_over_what_is_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -578,7 +566,7 @@ def test_a_fit_has_the_weights_that_were_asked_for(weighting: str | None, monkey
     monkeypatch.setattr(dynamics(made), "fit", lambda data, weights: fitted.append(weights) or {})
     data = made.transitions("target")
     th.manual_seed(3)
-    made._fit_to_transitions()
+    made.fit_dynamics()
     th.manual_seed(3)
     alive = 1 - data.terminations.float()
     if weighting == "value_aware":
@@ -596,26 +584,24 @@ def test_a_fit_has_the_weights_that_were_asked_for(weighting: str | None, monkey
 def test_an_unstable_correction_is_refused(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     made = filled(friction())
     before = dynamics(made).describe()
-    monkeypatch.setattr(controller, "stays_finite", lambda *_: False)
-    assert made.loop is not None
+    monkeypatch.setattr(acceptance, "stays_finite", lambda *_: False)
     with pytest.warns(UserWarning, match=r"coulomb_friction\(slider\).*unstable: refused"):
-        made.loop.close(made, dynamics(made))
+        made.loop.trace_transitions(made, dynamics(made))
     assert dynamics(made).describe() == before
-    assert not made.loop.accounts  # the simulator lacks what was found
+    assert not made.loop.simulator_validated  # the simulator lacks what was found
 
 
 @pytest.mark.slow
 def test_what_does_not_lower_the_error_is_refused_and_the_simulator_judges_nothing(
     soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(controller, "WORTH", 0.0)
+    change(monkeypatch, accepted_error=0.0)
     made = filled(friction())
-    assert made.loop is not None
     with pytest.warns(UserWarning, match=r"found coulomb_friction\(slider\), with which .* last simulator is kept"):
-        made.loop.close(made, dynamics(made))
+        made.loop.trace_transitions(made, dynamics(made))
     assert made.loop.found[-1]["verdict"] == "explained"
     assert dynamics(made).names == ["pole.length"]
-    assert not made.loop.accounts
+    assert not made.loop.simulator_validated
 
 
 @pytest.mark.parametrize("seen", [30, 0])
@@ -633,17 +619,17 @@ def test_instability_is_seen(seen: int) -> None:
 def test_another_trace_is_due_when_new_transitions_are_no_longer_predicted(
     soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(controller, "AGAIN", 20)
+    change(monkeypatch, next_trace=20)
     made = filled(friction())
     loop = made.loop
-    assert isinstance(loop, LoopCloser)
-    assert loop.due(made, dynamics(made))
-    loop.close(made, dynamics(made))
-    assert not loop.due(made, dynamics(made))
+    assert isinstance(loop, ClosedLoop)
+    assert loop.trace_due(made, dynamics(made))
+    loop.trace_transitions(made, dynamics(made))
+    assert not loop.trace_due(made, dynamics(made))
     append(made, friction(), 30)
-    assert not loop.due(made, dynamics(made))
+    assert not loop.trace_due(made, dynamics(made))
     append(made, [LIBRARY["torque_offset"]("hinge", offset=2.0)], 30)
-    assert loop.due(made, dynamics(made))
+    assert loop.trace_due(made, dynamics(made))
 
 
 @pytest.mark.parametrize(("error", "due"), [(1.9, False), (2.1, True)])
@@ -652,12 +638,12 @@ def test_new_transitions_have_to_be_predicted_twice_as_badly_for_another_trace(
 ) -> None:
     made = filled(friction(), 120)
     loop = made.loop
-    assert isinstance(loop, LoopCloser)
-    monkeypatch.setattr(controller, "AGAIN", 20)
-    loop.found, loop._traced_at, loop._error, loop._untraced = [{"verdict": "explained"}], 100, 0.01, False
+    assert isinstance(loop, ClosedLoop)
+    change(monkeypatch, next_trace=20)
+    loop.found, loop.traced_at, loop.traced_error, loop.trace_failed = [{"verdict": "explained"}], 100, 0.01, False
     asked = []
     monkeypatch.setattr(dynamics(made), "error", lambda data: (asked.append(data.observations), 0.01 * error)[1])
-    assert loop.due(made, dynamics(made)) is due
+    assert loop.trace_due(made, dynamics(made)) is due
     th.testing.assert_close(asked[0], made.transitions("target").observations[100:])  # what came since
 
 
@@ -669,7 +655,7 @@ def test_effects_have_to_pay_and_declared_numbers_to_be_no_worse(
 ) -> None:
     made = filled(friction(), 60)
     loop, (length,) = made.loop, dynamics(made).effects()
-    assert isinstance(loop, LoopCloser)
+    assert isinstance(loop, ClosedLoop)
     data = made.transitions("target")
     monkeypatch.setattr(dynamics(made), "error", lambda _: after)
 
@@ -682,7 +668,7 @@ def test_effects_have_to_pay_and_declared_numbers_to_be_no_worse(
         )
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=r"the trace found coulomb_friction")
-            loop._take(made, dynamics(made), cast(Report, report), data, before=1.0)
+            loop.accept(made, dynamics(made), cast(Report, report), data, before=1.0)
         return dynamics(made).names
 
     moved = length.with_values(1.1 * length.values)
@@ -698,27 +684,26 @@ def test_what_was_not_explained_is_looked_for_again_in_twice_as_many_transitions
 ) -> None:
     made = filled(friction())
     loop = made.loop
-    assert isinstance(loop, LoopCloser)
-    loop.close(made, dynamics(made))
+    assert isinstance(loop, ClosedLoop)
+    loop.trace_transitions(made, dynamics(made))
     loop.found[-1]["verdict"] = verdict
     append(made, friction(), 99)
-    assert not loop.due(made, dynamics(made))
+    assert not loop.trace_due(made, dynamics(made))
     append(made, friction(), 110)
-    assert loop.due(made, dynamics(made)) == due
+    assert loop.trace_due(made, dynamics(made)) == due
 
 
 @pytest.mark.slow
 def test_a_new_target_is_traced_anew(soon: None) -> None:
     made = filled(friction())
-    assert made.loop is not None
-    made.loop.close(made, dynamics(made))
+    made.loop.trace_transitions(made, dynamics(made))
     lacks: list[Effect] = [LIBRARY["torque_offset"]("hinge", offset=2.0)]
     with pytest.warns(UserWarning, match="D_target loses 101"):
         made.set_target_env(target(lacks))
     append(made, lacks, 70)
-    assert not made.loop.due(made, dynamics(made))
+    assert not made.loop.trace_due(made, dynamics(made))
     append(made, lacks, 10)  # as many as a first trace takes
-    assert made.loop.due(made, dynamics(made))
+    assert made.loop.trace_due(made, dynamics(made))
 
 
 def explanation(
@@ -733,12 +718,11 @@ def explanation(
 
 def test_a_later_explanation_takes_the_place_of_an_earlier_one() -> None:
     made = filled(friction())
-    assert made.loop is not None
     data, phi = made.transitions("target"), dynamics(made)
     phi.adopt([LIBRARY["viscous_friction"]("slider", coefficient=0.5)])
     phi.fit(data, max_steps=30)
     report = explanation([*phi.effects()[:1], *friction()])
-    added = made.loop._take(made, phi, report, data, phi.error(data))  # type: ignore[arg-type]
+    added = made.loop.accept(made, phi, report, data, phi.error(data))  # type: ignore[arg-type]
     assert added == ["coulomb_friction(slider)"]
     assert phi.names == ["pole.length", "coulomb_friction(slider).level"]
 
@@ -748,25 +732,23 @@ def test_a_later_explanation_takes_the_place_of_an_earlier_one() -> None:
 def test_another_trace_is_due_though_transitions_are_forgotten(
     forgotten: str, soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(controller, "AGAIN", 20)
+    change(monkeypatch, next_trace=20)
     wide = None if forgotten.startswith("all") else {"target_size": 90}
     made = filled(friction(), replay_buffer_kwargs=wide)
-    assert made.loop is not None
-    made.loop.close(made, dynamics(made))
+    made.loop.trace_transitions(made, dynamics(made))
     if wide is None:
         made.replay_buffer = model(friction()).replay_buffer
     append(made, [LIBRARY["torque_offset"]("hinge", offset=2.0)], 19)
-    assert not made.loop.due(made, dynamics(made))
+    assert not made.loop.trace_due(made, dynamics(made))
     append(made, [LIBRARY["torque_offset"]("hinge", offset=2.0)], 11)
-    assert made.loop.due(made, dynamics(made))
+    assert made.loop.trace_due(made, dynamics(made))
 
 
 def test_a_small_memory_is_traced_when_it_is_full(soon: None) -> None:
     made = filled(friction(), 48, replay_buffer_kwargs={"target_size": 50})
-    assert made.loop is not None
-    assert not made.loop.due(made, dynamics(made))
+    assert not made.loop.trace_due(made, dynamics(made))
     append(made, friction(), 1)
-    assert made.loop.due(made, dynamics(made))
+    assert made.loop.trace_due(made, dynamics(made))
 
 
 @pytest.mark.slow
@@ -777,7 +759,7 @@ def test_learning_in_the_corrected_simulator_goes_on_where_it_was_interrupted(
     train, left = made.train, iter(range(5))
 
     def interrupted(steps: int, batch_size: int) -> None:
-        if made.loop is not None and made.loop.stale and next(left, None) is None:
+        if made.loop is not None and made.loop.source_buffer_stale and next(left, None) is None:
             raise KeyboardInterrupt
         train(steps, batch_size)
 
@@ -787,20 +769,20 @@ def test_learning_in_the_corrected_simulator_goes_on_where_it_was_interrupted(
     loop = made.loop
     assert loop is not None
     assert loop.found
-    assert loop.stale
-    assert loop.rounds is not None
-    done = loop.rounds.steps
-    assert done == 5 * made.fresh_steps()
+    assert loop.source_buffer_stale
+    assert loop.retraining is not None
+    done = loop.retraining.steps
+    assert done == 5 * made.fresh_source_steps()
     acting, learner = weights(made), made.snapshots["learner"]
     made.rollback("simulator")
     np.testing.assert_array_equal(acting, weights(made))  # not what was learned and judged by nobody
     made.snapshots["learner"] = learner
     before, begun = made.source_timesteps, list[np.ndarray]()
-    monkeypatch.setattr(made, "train", lambda *_: begun.append(weights(made)) if loop.stale else None)  # type: ignore[func-returns-value]
-    monkeypatch.setattr(loop, "rehearse", lambda made: None)
+    monkeypatch.setattr(made, "train", lambda *_: begun.append(weights(made)) if loop.source_buffer_stale else None)  # type: ignore[func-returns-value]
+    monkeypatch.setattr(loop.selection, "evaluate", lambda *_: None)
     made.learn(1, reset_num_timesteps=False)
-    assert (loop.stale, loop.rounds) == (False, None)
-    learned = made.fresh_steps() * len(begun)
+    assert (loop.source_buffer_stale, loop.retraining) == (False, None)
+    learned = made.fresh_source_steps() * len(begun)
     assert learned == 400 - done
     assert made.source_timesteps - before >= learned
     made.snapshots["learner"] = learner
@@ -816,7 +798,7 @@ def test_encoder_zeros_that_differ_by_run_are_taken_off_the_log(monkeypatch: pyt
     def positions(zeros: EncoderOffsets | None) -> tuple[RPTO, np.ndarray]:
         made = model([], target_data=measured)
         said = explanation([], zeros=zeros)
-        monkeypatch.setattr(made.loop, "_trace", lambda *_: made.loop.found.append({"verdict": "explained"}) or said)  # type: ignore[union-attr,func-returns-value]
+        monkeypatch.setattr(made.loop, "identify", lambda *_: made.loop.found.append({"verdict": "explained"}) or said)  # type: ignore[union-attr,func-returns-value]
         made.learn(4, source_timesteps=0)
         return made, made.transitions("target").observations[:, 0].numpy()
 
@@ -832,9 +814,8 @@ def test_encoder_zeros_that_differ_by_run_are_taken_off_the_log(monkeypatch: pyt
 def test_a_budget_of_source_steps_is_not_exceeded_by_the_loop(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded = filled(friction()).replay_buffer
     made = model([], target_data=recorded)
-    assert made.loop is not None
-    monkeypatch.setattr(made.loop, "_trace", lambda *_: explanation(friction()))
-    monkeypatch.setattr(Rounds, "learn", lambda *_: pytest.fail("learns beyond the budget"))
+    monkeypatch.setattr(made.loop, "identify", lambda *_: explanation(friction()))
+    monkeypatch.setattr(Retraining, "learn", lambda *_: pytest.fail("learns beyond the budget"))
     made.learn(200, source_timesteps=0)
     assert "coulomb_friction(slider).level" in dynamics(made).names
 
@@ -842,13 +823,12 @@ def test_a_budget_of_source_steps_is_not_exceeded_by_the_loop(soon: None, monkey
 def test_a_policy_that_knows_the_source_begins_in_the_corrected_one(monkeypatch: pytest.MonkeyPatch) -> None:
     measured = Measurements.from_replay(filled(friction()).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured)
-    made._warm = True
-    assert made.loop is not None
+    made.state.knows_source = True
     monkeypatch.setattr(
-        made.loop, "_trace", lambda *_: made.loop.found.append({"verdict": "explained"}) or explanation(friction())
+        made.loop, "identify", lambda *_: made.loop.found.append({"verdict": "explained"}) or explanation(friction())
     )  # type: ignore[union-attr,func-returns-value]
     monkeypatch.setattr(
-        controller, "renew_source", lambda *_: pytest.fail("drops what the corrected simulator produced")
+        controller, "reset_source_buffer", lambda *_: pytest.fail("drops what the corrected simulator produced")
     )
     made.learn(8)
     seen = made.replay_buffer.target.size()
@@ -883,8 +863,8 @@ def test_what_cannot_be_closed_is_refused(settings: dict[str, object], said: str
 
 @pytest.mark.parametrize("kind", [friction()[0], type(friction()[0]), 1])
 def test_what_to_look_for_is_told_by_kinds(kind: object) -> None:
-    with pytest.raises(TypeError, match=r"close_loop holds kinds .*dynamics_kwargs=\{'effects'"):
-        model([], close_loop=[kind])
+    with pytest.raises(TypeError, match=r"effects holds kinds .*dynamics_kwargs=\{'effects'"):
+        model([], effects=[kind])
 
 
 @pytest.mark.slow
@@ -892,8 +872,7 @@ def test_recorded_transitions_that_are_few_are_traced_as_they_become_no_more() -
     recorded = filled(friction()).replay_buffer
     made = model([], target_env=None, target_data=recorded, model_train_freq=20)
     made.learn(40, source_timesteps=0)
-    assert made.loop is not None
-    assert recorded.target.size() == 101 < controller.FIRST
+    assert recorded.target.size() == 101 < ClosedLoop.settings.first_trace
     assert [found["verdict"] for found in made.loop.found] == ["explained"]
 
 
@@ -928,35 +907,27 @@ class Scripted(EpisodeSource):
         self.earns = iter(earns)
         self.asked: list[int] = []
 
-    def interact(self, model: Any, n_steps: int, random: bool = False) -> int:
+    def interact(self, agent: Any, n_steps: int, random: bool = False) -> int:
         self.asked.append(n_steps)
-        model.source_timesteps += n_steps
+        agent.state.source_timesteps += n_steps
         self.returns.extend([r] if (r := next(self.earns, None)) is not None else [])
         return n_steps
 
 
 class Judge:
-    """Stands for a loop whose simulator judges: each rehearsal earns the next of ``earns``."""
+    """Stands for the evaluation of policies in the simulator: each earns the next of ``earns``."""
 
-    def __init__(self, earns: list[float], judges: bool) -> None:
-        self.earns, self.judges, self.rehearsals = earns, judges, self
+    def __init__(self, earns: list[float]) -> None:
+        self.earns = earns
         self.best, self.asked = -np.inf, 0
-        self.told: list[float] = []
-
-    def progress(self, share: float, what: str) -> None:
-        assert what.startswith("learning in the corrected simulator")
-        self.told.append(share)
-
-    def may_judge(self, model: Any) -> bool:
-        return self.judges
 
     def due(self, updates: int) -> bool:
         return True
 
-    def is_behind(self, model: Any) -> bool:
+    def is_behind(self, agent: Any) -> bool:
         return True
 
-    def rehearse(self, model: Any) -> None:
+    def evaluate(self, agent: Any, dynamics: Any) -> None:
         self.best = max([self.best, *self.earns[: self.asked]])
         self.asked += 1
 
@@ -980,51 +951,56 @@ GAINS = [
     ],
 )
 def test_learning_in_the_corrected_simulator_goes_on_while_it_pays(
-    earns: list[float], lasts: int, judges: bool, monkeypatch: pytest.MonkeyPatch
+    earns: list[float], lasts: int, judges: bool
 ) -> None:
-    monkeypatch.setattr(retraining, "ROUND", 160)
     updates: list[int] = []
     remaining: list[float] = []
+    told: list[float] = []
     # What does not count earns ever more.
-    source, judge = Scripted([float(i) for i in range(9)] if judges else earns), Judge(earns, judges)
+    source, judge = Scripted([float(i) for i in range(9)] if judges else earns), Judge(earns)
     made = SimpleNamespace(
-        _source_world=source,
-        _n_updates=0,
+        rollouts=source,
+        state=SimpleNamespace(source_timesteps=5),
+        n_updates=0,
         updates_per_step=30,
         source_steps=20,
         retrain_steps=1_280,
         batch_size=32,
-        source_timesteps=5,
         verbose=0,
         train=lambda n, batch_size: updates.append(n),
-        fresh_steps=lambda: 160,
-        _update_current_progress_remaining=lambda taken, most: remaining.append(1 - taken / most),
+        fresh_source_steps=lambda: 160,
+        set_progress=lambda taken, most: remaining.append(1 - taken / most),
     )
-    Rounds().learn(made, judge)  # type: ignore[arg-type]
+
+    def progress(share: float, what: str) -> None:
+        assert what.startswith("learning in the corrected simulator")
+        told.append(share)
+
+    learning = Retraining(replace(ClosedLoop.settings, round_steps=160))
+    learning.learn(made, object(), judge if judges else None, progress)  # type: ignore[arg-type]
     assert remaining == [1 - 160 * i / 1_280 for i in range(lasts)]  # for a schedule of the learning rate
     assert updates == [30] * lasts
-    assert judge.told == [i / 8 for i in range(lasts + 1)]
-    assert judge.asked == 1 + lasts + 1
+    assert told == [i / 8 for i in range(lasts + 1)]
+    assert judge.asked == (1 + lasts + 1 if judges else 0)
     assert source.asked == [8 * 20] * lasts  # in the source each call draws gSDE's noise anew
-    assert made.source_timesteps == 5 + 8 * 20 * lasts
+    assert made.state.source_timesteps == 5 + 8 * 20 * lasts
 
 
 @pytest.mark.parametrize(("updates", "copies", "steps"), [(20, 20, 160), (20, 160, 160), (1, 20, 20), (3, 10, 30)])
 def test_eight_steps_for_each_update_are_taken_by_whole_copies(updates: int, copies: int, steps: int) -> None:
-    assert filled([], 1, gradient_steps=updates, source_steps=copies).fresh_steps() == steps
+    assert filled([], 1, gradient_steps=updates, source_steps=copies).fresh_source_steps() == steps
 
 
 def test_a_schedule_of_the_learning_rate_does_not_end_what_target_steps_paid_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = forgetful()
-    assert made.loop is not None
-    made._total_timesteps, made.num_timesteps, made._owed = 10, 10, 4
+    made._total_timesteps, made.num_timesteps, made.state.deferred_target_steps = 10, 10, 4
     left: list[float] = []
     monkeypatch.setattr(made, "train", lambda steps, batch_size: left.append(made._current_progress_remaining))
-    monkeypatch.setattr(made.loop, "accounts", False)
-    made._source_world = Scripted([])  # type: ignore[assignment]
-    made.loop._learn_what_is_owed(made)
+    made.loop.simulator_validated = False
+    made.rollouts = Scripted([])  # type: ignore[assignment]
+    made.loop.learn_deferred_steps(made)
     assert left == pytest.approx([0.4, 0.3, 0.2, 0.1])
 
 
@@ -1034,15 +1010,14 @@ def test_a_schedule_of_the_learning_rate_does_not_end_what_target_steps_paid_for
 def forgetful() -> RPTO:
     """A model in a simulator that accounts for the target."""
     made = filled([], 20)
-    assert made.loop is not None
-    made.loop.accounts = True
+    made.loop.simulator_validated = True
     made.take_snapshot("source")
     spoil(made, 1e-3)  # not saturated, so that it can learn
     return made
 
 
 def plays(earns: Callable[[], float]) -> Callable[..., np.ndarray]:
-    """Rehearsals whose episodes all earn what is told, the further ones of a policy as much as its first."""
+    """PolicySelection whose episodes all earn what is told, the further ones of a policy as much as its first."""
     earned: dict[bytes, float] = {}
 
     def play(model: RPTO, dynamics: PhysicalDynamics, starts: range) -> np.ndarray:
@@ -1056,10 +1031,9 @@ def plays(earns: Callable[[], float]) -> Callable[..., np.ndarray]:
 
 def scripted(made: RPTO, monkeypatch: pytest.MonkeyPatch, *earns: float) -> None:
     """Let rehearsals earn what is written."""
-    assert made.loop is not None
     found = iter(earns)
-    monkeypatch.setattr(made.loop.rehearsals, "_play", plays(lambda: next(found)))
-    monkeypatch.setattr(made.loop.rehearsals, "due", lambda _: True)
+    monkeypatch.setattr(made.loop.selection, "play", plays(lambda: next(found)))
+    monkeypatch.setattr(made.loop.selection, "due", lambda _: True)
 
 
 def weights(made: RPTO) -> np.ndarray:
@@ -1078,12 +1052,11 @@ def test_the_best_policy_acts_and_one_that_did_not_clearly_get_worse_goes_on_lea
 ) -> None:
     made = forgetful()
     scripted(made, monkeypatch, 50.0, 100.0, earned)
-    assert made.loop is not None
-    made.loop.watch(made)  # that of the source earned 50
+    made.loop.learn_deferred(made)  # that of the source earned 50
     best = weights(made)
     spoil(made)
     changed = weights(made)
-    made.loop.watch(made)
+    made.loop.learn_deferred(made)
     np.testing.assert_array_equal(weights(made), changed if earned > 100 else best)
     assert ("learner" in made.snapshots) == (earned == 98.0)
     made.rollback("simulator")
@@ -1097,20 +1070,19 @@ def test_what_is_owed_is_learned_by_the_policy_that_goes_on_learning(
 ) -> None:
     made = forgetful()
     scripted(made, monkeypatch, 50.0, 100.0, earned, 99.0)
-    assert made.loop is not None
-    made.loop.watch(made)
+    made.loop.learn_deferred(made)
     wanted = {"best": weights(made)}
     spoil(made)
     wanted["learner"] = weights(made)
-    made.loop.watch(made)
+    made.loop.learn_deferred(made)
     begun: list[np.ndarray] = []
     monkeypatch.setattr(made, "train", lambda *_: begun.append(weights(made)))
-    made._owed = 3
-    monkeypatch.setattr(made.loop.rehearsals, "due", lambda updates: updates > made._n_updates)
-    made.loop.watch(made)
+    made.state.deferred_target_steps = 3
+    monkeypatch.setattr(made.loop.selection, "due", lambda updates: updates > made._n_updates)
+    made.loop.learn_deferred(made)
     np.testing.assert_array_equal(begun, [wanted[goes_on]] * 3)
     np.testing.assert_array_equal(weights(made), wanted["best"])
-    assert made._owed == 0
+    assert made.state.deferred_target_steps == 0
 
 
 class Watch(BaseCallback):
@@ -1129,11 +1101,11 @@ class Watch(BaseCallback):
 
 def judged(monkeypatch: pytest.MonkeyPatch, every: int = 40, earns: Callable[[], float] = lambda: 1.0) -> RPTO:
     """A model whose simulator judges a policy of so many updates, and finds it to earn what is told."""
-    monkeypatch.setattr("sb3_rpto.algorithms.closed_loop.policy_selection.EVERY", every)
-    monkeypatch.setattr(Rehearsals, "_play", staticmethod(plays(earns)))
-    monkeypatch.setattr(LoopCloser, "due", lambda *_: False)
+    change(monkeypatch, updates_between=every)
+    monkeypatch.setattr(PolicySelection, "play", staticmethod(plays(earns)))
+    monkeypatch.setattr(ClosedLoop, "trace_due", lambda *_: False)
     made = forgetful()
-    made._since_fit = 0
+    made.state.steps_since_fit = 0
     return made
 
 
@@ -1146,14 +1118,14 @@ def test_between_fits_the_policy_stays_as_the_simulator_judged_it(monkeypatch: p
     assert [len(set(seen.acting[i : i + 40])) for i in (0, 40, 80, 120)] == [1, 1, 1, 1]
     assert len(set(seen.acting)) == 4
     # What is owed in the end is learned, too.
-    assert (made._n_updates - updates, made._owed) == (130, 0)
+    assert (made._n_updates - updates, made.state.deferred_target_steps) == (130, 0)
     assert made.source_timesteps - source == 4 * 130  # rehearsals are scripted
 
 
 def test_the_end_of_learning_leaves_the_learner_where_nothing_is_owed(monkeypatch: pytest.MonkeyPatch) -> None:
     earned = chain([50.0, 100.0], repeat(99.0))
     made = judged(monkeypatch, earns=lambda: next(earned))
-    monkeypatch.setattr(Rehearsals, "_has_moved", lambda self, _: self._phi is None)
+    monkeypatch.setattr(PolicySelection, "has_moved", lambda self, _: self._phi is None)
     made.learn(80, reset_num_timesteps=False)  # ends with a fit
     acting = weights(made)
     made.rollback("learner")
@@ -1163,11 +1135,10 @@ def test_the_end_of_learning_leaves_the_learner_where_nothing_is_owed(monkeypatc
 def test_policies_are_rehearsed_on_the_way_where_much_is_owed(monkeypatch: pytest.MonkeyPatch) -> None:
     at: list[int] = []
     made = judged(monkeypatch, every=10, earns=lambda: at.append(made._n_updates) or 1.0)  # type: ignore[func-returns-value]
-    assert made.loop is not None
-    made.loop.watch(made)
+    made.loop.learn_deferred(made)
     at.clear()
-    updates, made._owed = made._n_updates, 34
-    made.loop.watch(made)
+    updates, made.state.deferred_target_steps = made._n_updates, 34
+    made.loop.learn_deferred(made)
     assert [n - updates for n in at] == [10, 20, 30, 34]
 
 
@@ -1178,17 +1149,17 @@ def test_a_judged_policy_that_was_stopped_goes_on_as_if_it_had_not_been(
     # That of the source, the first one, which is the best, and all later ones.
     earned = chain([50.0, 100.0], repeat(99.0))
     unbroken = judged(monkeypatch, earns=lambda: next(earned))
-    monkeypatch.setattr(Rehearsals, "_has_moved", lambda self, _: self._phi is None)
+    monkeypatch.setattr(PolicySelection, "has_moved", lambda self, _: self._phi is None)
     at = unbroken.num_timesteps + 95
     unbroken.learn(200, callback=lambda *_: unbroken.num_timesteps < at, reset_num_timesteps=False)
     unbroken.save(tmp_path / "model")
     unbroken.save_replay_buffer(tmp_path / "buffer")
 
     def end(made: RPTO) -> np.ndarray:
-        assert made._owed == 14  # the round of the last step is open
+        assert made.state.deferred_target_steps == 14  # the round of the last step is open
         assert "learner" in made.snapshots
         made.learn(60, reset_num_timesteps=False)
-        assert made._owed == 0
+        assert made.state.deferred_target_steps == 0
         acting = weights(made)
         made.rollback("learner")
         assert not np.array_equal(acting, weights(made))
@@ -1218,24 +1189,23 @@ def test_a_judged_policy_acts_where_learning_was_interrupted_and_nothing_is_lear
     with pytest.raises(KeyboardInterrupt):
         made.learn(40, reset_num_timesteps=False)
     np.testing.assert_array_equal(weights(made), acting)
-    assert (made._n_updates - updates, made._owed) == (30, 10)
+    assert (made._n_updates - updates, made.state.deferred_target_steps) == (30, 10)
     monkeypatch.setattr(made, "train", train)
     begun: list[np.ndarray] = []
     learn = controller.learn_for_a_step
     monkeypatch.setattr(controller, "learn_for_a_step", lambda m, n: begun.append(weights(m)) or learn(m, n))  # type: ignore[func-returns-value]
     made.learn(40, reset_num_timesteps=False)
-    assert (made._n_updates - updates, made._owed) == (80, 0)
+    assert (made._n_updates - updates, made.state.deferred_target_steps) == (80, 0)
     assert not np.array_equal(begun[0], acting)  # the one that was interrupted
 
 
 def test_what_the_policy_that_acts_earns_is_the_last_word(capsys: pytest.CaptureFixture[str]) -> None:
     made = forgetful()
-    assert made.loop is not None
-    made.loop.finish(made)
+    made.loop.on_end(made)
     assert not capsys.readouterr().out
     made.verbose = 1
-    made.loop.finish(made)
-    earns = f"{made.loop.rehearsals.best:.5g}"
+    made.loop.on_end(made)
+    earns = f"{made.loop.selection.best:.5g}"
     assert capsys.readouterr().out.splitlines()[-1].endswith(f"the best so far, earns {earns} in the simulator")
 
 
@@ -1248,34 +1218,31 @@ def test_parameters_that_a_user_sets_go_on_learning() -> None:
 
 def test_another_target_is_owed_nothing() -> None:
     made = forgetful()
-    made._owed = 30
+    made.state.deferred_target_steps = 30
     made.take_snapshot("learner")
     with pytest.warns(UserWarning, match="D_target loses"):
         made.set_target_env(target(friction()))
-    assert made._owed == 0
+    assert made.state.deferred_target_steps == 0
     assert "learner" not in made.snapshots
     assert made.replay_buffer.target_added == 0, "else a second trace of this target waits for twice both"
-    assert made.loop is not None
-    assert not made.loop.traced
+    assert made.loop.awaits_trace()
 
 
 def test_what_is_owed_is_learned_where_a_new_trace_no_longer_accounts_for_the_target(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = judged(monkeypatch)
-    made.learn(20, reset_num_timesteps=False, callback=lambda *_: made._owed < 10)
-    assert made.loop is not None
-    updates, owed = made._n_updates, made._owed
-    made.loop.accounts = False
-    made.loop.watch(made)
-    assert (owed, made._n_updates - updates, made._owed) == (10, 10, 0)
+    made.learn(20, reset_num_timesteps=False, callback=lambda *_: made.state.deferred_target_steps < 10)
+    updates, owed = made._n_updates, made.state.deferred_target_steps
+    made.loop.simulator_validated = False
+    made.loop.learn_deferred(made)
+    assert (owed, made._n_updates - updates, made.state.deferred_target_steps) == (10, 10, 0)
 
 
 @pytest.mark.parametrize("accounts", [True, False])
 def test_the_actor_sees_the_simulators_states_alone_where_it_accounts_for_the_target(accounts: bool) -> None:
     made = forgetful()
-    assert made.loop is not None
-    made.loop.accounts = accounts
+    made.loop.simulator_validated = accounts
     made.replay_buffer.source.rewards[:], made.replay_buffer.target.rewards[:] = -1, 1
     worlds = {float(actor.rewards.mean()) for _, actor in made.sample_batches(10, 16)}
     assert worlds == ({-1.0} if accounts else {-1.0, 1.0})
@@ -1288,8 +1255,7 @@ def test_the_critic_sees_no_estimated_states_where_the_simulator_accounts_for_a_
 ) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, real_ratio=0.5).learn(40, source_timesteps=0)
-    assert made.loop is not None
-    made.loop.accounts = accounts
+    made.loop.simulator_validated = accounts
     made.replay_buffer.source.rewards[:], made.replay_buffer.target.rewards[:] = 0, 1
     assert [float(batch.rewards.mean()) for batch in made.critic_batches(3, 16)] == [share] * 3
 
@@ -1301,12 +1267,11 @@ def test_many_steps_are_taken_for_each_update_where_the_simulator_accounts_for_a
 ) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, source_steps=5).learn(40, source_timesteps=0)
-    assert made.loop is not None
-    made.loop.accounts = accounts
-    taken, before = made.source_timesteps - made.loop.rehearsals.steps, made._n_updates
+    made.loop.simulator_validated = accounts
+    taken, before = made.source_timesteps - made.loop.selection.steps, made._n_updates
     made.learn(100, reset_num_timesteps=False)
     assert made.num_timesteps == 140  # the budget counts each of them
-    assert made.source_timesteps - made.loop.rehearsals.steps - taken == 100
+    assert made.source_timesteps - made.loop.selection.steps - taken == 100
     assert made._n_updates - before == updates
 
 
@@ -1314,17 +1279,16 @@ def test_many_steps_are_taken_for_each_update_where_the_simulator_accounts_for_a
 def test_after_a_log_the_best_policy_is_left_and_the_last_one_goes_on_learning(monkeypatch: pytest.MonkeyPatch) -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)
-    assert made.loop is not None
     scripted(made, monkeypatch, 99.0, 99.0)
-    monkeypatch.setattr(made.loop.rehearsals, "due", lambda _: False)
-    made.loop.rehearsals._leads = False
+    monkeypatch.setattr(made.loop.selection, "due", lambda _: False)
+    made.loop.selection.last_leads = False
     best = weights(made)
     made.take_snapshot("simulator")
     spoil(made)
     last = weights(made)
-    made.loop.finish(made)
+    made.loop.on_end(made)
     np.testing.assert_array_equal(weights(made), best)
-    made.loop.begin(made)
+    made.loop.on_start(made)
     np.testing.assert_array_equal(weights(made), last)
 
 
@@ -1332,10 +1296,9 @@ def test_a_callback_that_stops_a_run_on_a_log_leaves_the_best_policy(
     kept_on_a_log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = on_a_log(kept_on_a_log)
-    assert made.loop is not None
-    assert made.loop.accounts
+    assert made.loop.simulator_validated
     finished: list[object] = []
-    monkeypatch.setattr(made.loop, "finish", finished.append)
+    monkeypatch.setattr(made.loop, "on_end", finished.append)
     made.learn(500, callback=lambda *_: made.num_timesteps < 200, reset_num_timesteps=False)
     assert made.num_timesteps < 540
     assert finished == [made]
@@ -1350,18 +1313,16 @@ def test_a_target_after_a_log_is_not_traced_where_nobody_asked(
     with pytest.warns(UserWarning, match="ends before the first fit of the dynamics, after 20"):
         arguments.check_ready(made, 10, None)
     judged: list[float] = []
-    monkeypatch.setattr("sb3_rpto.algorithms.two_env_sac.doubt", lambda _, error, data: judged.append(error))
+    monkeypatch.setattr("sb3_rpto.algorithms.target_checks.doubt", lambda _, error, data: judged.append(error))
     made.learn(45)
     assert len(judged) == 1
-    assert made.loop is not None
     assert len(made.loop.found) == 1  # that of the log
 
 
 def test_the_first_policy_to_be_beaten_is_that_of_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
     made = forgetful()
     scripted(made, monkeypatch, 50.0, 30.0)
-    assert made.loop is not None
-    made.loop.watch(made)
+    made.loop.learn_deferred(made)
     last = weights(made)
     made.rollback("source")
     np.testing.assert_array_equal(weights(made), last)
@@ -1370,28 +1331,26 @@ def test_the_first_policy_to_be_beaten_is_that_of_the_source(monkeypatch: pytest
 def test_what_was_earned_in_another_simulator_is_earned_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     made = forgetful()
     scripted(made, monkeypatch, 50.0, 100.0, 40.0, 45.0)
-    assert made.loop is not None
-    made.loop.watch(made)
+    made.loop.learn_deferred(made)
     dynamics(made).fit(made.transitions("target"), max_steps=30)  # the target's pole is longer
-    made.loop.watch(made)
-    assert (made.loop.rehearsals.best, made.loop.rehearsals.last) == (45.0, 45.0)
+    made.loop.learn_deferred(made)
+    assert (made.loop.selection.best, made.loop.selection.last) == (45.0, 45.0)
 
 
 def test_a_loss_within_what_episodes_differ_by_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """Near a return of zero any change is a large share of it."""
     made = forgetful()
-    assert made.loop is not None
     spread = np.random.default_rng(0).normal(0.0, 0.5, 100)
     played = plays(iter([0.0, 0.02, 0.01, -5.0]).__next__)
-    monkeypatch.setattr(made.loop.rehearsals, "_play", lambda _, __, starts: played(_, __, starts) + spread[starts])
-    monkeypatch.setattr(made.loop.rehearsals, "due", lambda _: True)
-    made.loop.watch(made)
+    monkeypatch.setattr(made.loop.selection, "play", lambda _, __, starts: played(_, __, starts) + spread[starts])
+    monkeypatch.setattr(made.loop.selection, "due", lambda _: True)
+    made.loop.learn_deferred(made)
     spoil(made)
     changed = weights(made)
-    made.loop.watch(made)
-    made.loop.rehearsals.take_up_learner(made)
+    made.loop.learn_deferred(made)
+    made.loop.selection.take_up_learner(made)
     np.testing.assert_array_equal(weights(made), changed)
-    made.loop.watch(made)
+    made.loop.learn_deferred(made)
     assert "learner" not in made.snapshots
     assert not np.array_equal(weights(made), changed)
 
@@ -1399,11 +1358,10 @@ def test_a_loss_within_what_episodes_differ_by_is_none(monkeypatch: pytest.Monke
 def test_what_an_earlier_simulator_said_undoes_nothing(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
     made = forgetful()
     scripted(made, monkeypatch, 50.0, 100.0, 98.0)
-    assert made.loop is not None
-    made.loop.watch(made)
-    made.loop.watch(made)  # worse, but not clearly
-    made.loop.accounts, made.loop.stale, made.loop._traced_at = False, True, 1
-    made.loop.renew(made)  # learns in a simulator that may not judge
+    made.loop.learn_deferred(made)
+    made.loop.learn_deferred(made)  # worse, but not clearly
+    made.loop.simulator_validated, made.loop.source_buffer_stale, made.loop.traced_at = False, True, 1
+    made.loop.retrain(made)  # learns in a simulator that may not judge
     learned_there = weights(made)
     made.rollback("simulator")
     assert not np.array_equal(weights(made), learned_there)
@@ -1412,13 +1370,12 @@ def test_what_an_earlier_simulator_said_undoes_nothing(soon: None, monkeypatch: 
 def test_another_target_is_not_judged_by_the_simulator_of_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
     made = forgetful()
     scripted(made, monkeypatch, 50.0, 100.0)
-    assert made.loop is not None
-    made.loop.watch(made)
+    made.loop.learn_deferred(made)
     with pytest.warns(UserWarning, match="D_target loses"):
         made.set_target_env(target(friction()))
     assert "simulator" not in made.snapshots
-    made.loop.watch(made)
-    assert made.loop.rehearsals.best == -np.inf
+    made.loop.learn_deferred(made)
+    assert made.loop.selection.best == -np.inf
 
 
 def test_a_snapshot_of_ones_own_does_not_stand_for_that_of_the_source(soon: None) -> None:
@@ -1430,11 +1387,10 @@ def test_a_snapshot_of_ones_own_does_not_stand_for_that_of_the_source(soon: None
 
 def test_a_simulator_that_does_not_account_for_the_target_judges_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     made = forgetful()
-    assert made.loop is not None
-    made.loop.accounts = False
+    made.loop.simulator_validated = False
     scripted(made, monkeypatch)
-    made.loop.watch(made)
-    assert made.loop.rehearsals.best == -np.inf
+    made.loop.learn_deferred(made)
+    assert made.loop.selection.best == -np.inf
 
 
 def test_a_rehearsal_plays_the_deterministic_policy_in_the_fitted_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1442,12 +1398,10 @@ def test_a_rehearsal_plays_the_deterministic_policy_in_the_fitted_simulator(monk
     data = made.transitions("target")
     for _ in range(5):
         dynamics(made).fit(data, max_steps=30)
-    assert made.loop is not None
-    rehearsals, before = made.loop.rehearsals, made.source_timesteps
-    monkeypatch.setattr("sb3_rpto.algorithms.closed_loop.policy_selection.FEW", 2)
-    monkeypatch.setattr("sb3_rpto.algorithms.closed_loop.policy_selection.SOME", 3)
+    rehearsals, before = made.loop.selection, made.source_timesteps
+    rehearsals.settings = replace(rehearsals.settings, few_episodes=2, some_episodes=3)
     made.rollback("source")
-    rehearsals.rehearse(made, dynamics(made))
+    rehearsals.evaluate(made, dynamics(made))
     returns, lengths = [], []
     env = target([])
     for i in range(3):
@@ -1474,8 +1428,8 @@ def test_a_rehearsal_lasts_as_long_as_episodes_do_and_shows_the_policy_what_it_k
         **{"target_env": gym.make("HalfCheetah-v5"), "dynamics": "physical", "declared": ["torso.mass", "bfoot.mass"]},
         **{"close_loop": True, "policy_kwargs": {"net_arch": [16]}, "seed": 0, "device": "cpu"},
     )
-    rehearsals = Rehearsals()
-    (earned,) = rehearsals._play(made, dynamics(made), range(1))
+    rehearsals = PolicySelection(ClosedLoop.settings)
+    (earned,) = rehearsals.play(made, dynamics(made), range(1))
     assert rehearsals.steps == made.source_timesteps == 1_000
     real = gym.make("HalfCheetah-v5")
     observation, _ = real.reset(seed=30_000)
@@ -1486,9 +1440,9 @@ def test_a_rehearsal_lasts_as_long_as_episodes_do_and_shows_the_policy_what_it_k
         returned += float(reward)
     assert earned == pytest.approx(returned, rel=1e-3)
     rehearsals._phi, rehearsals._names = dynamics(made).values.copy(), list(dynamics(made).names)
-    assert not rehearsals._has_moved(dynamics(made))
+    assert not rehearsals.has_moved(dynamics(made))
     rehearsals._phi[1] *= 1.01  # one of them is enough
-    assert rehearsals._has_moved(dynamics(made))
+    assert rehearsals.has_moved(dynamics(made))
 
 
 FALLS, SPREAD = np.where(np.arange(100) % 5 == 3, 40.0, 100.0), np.random.default_rng(0).normal(size=100)
@@ -1520,9 +1474,9 @@ def test_a_policy_plays_until_it_is_clear_whether_it_is_the_best(
         played[who] += len(starts)
         return np.full(len(starts), 100.0) if who == "best" else returns[starts]
 
-    rehearsals = made.loop.rehearsals  # type: ignore[union-attr]
-    monkeypatch.setattr(rehearsals, "_play", play)
-    rehearsals.rehearse(made, dynamics(made))
+    rehearsals = made.loop.selection  # type: ignore[union-attr]
+    monkeypatch.setattr(rehearsals, "play", play)
+    rehearsals.evaluate(made, dynamics(made))
     assert played == {"best": 5 + further, "last": episodes}  # so many as it is compared with
     assert rehearsals.last == pytest.approx(returns[:episodes].mean())
     assert rehearsals.best == pytest.approx(rehearsals.last if taken else 100.0)
@@ -1544,11 +1498,11 @@ def test_a_policy_that_falls_now_and_then_gives_way_to_one_that_does_not(monkeyp
             known[policy] = next(earned)
         return known[policy][starts]
 
-    rehearsals = made.loop.rehearsals  # type: ignore[union-attr]
-    monkeypatch.setattr(rehearsals, "_play", play)
+    rehearsals = made.loop.selection  # type: ignore[union-attr]
+    monkeypatch.setattr(rehearsals, "play", play)
     taken = []
     for _ in range(4):
-        rehearsals.rehearse(made, dynamics(made))
+        rehearsals.evaluate(made, dynamics(made))
         best = made.snapshots["simulator"]["policy"]["actor.mu.weight"]
         taken.append(th.equal(best, made.actor.mu.weight))
         spoil(made, 1e-3)
@@ -1559,22 +1513,20 @@ def test_a_policy_that_falls_now_and_then_gives_way_to_one_that_does_not(monkeyp
 
 def test_a_reward_that_is_no_number_is_said_in_a_rehearsal_too(monkeypatch: pytest.MonkeyPatch) -> None:
     made = forgetful()
-    assert made.loop is not None
     monkeypatch.setattr(
         "sb3_rpto.algorithms.closed_loop.policy_selection.StandingEnv.step",
         lambda env, action: (env.observation_space.sample(), np.nan, True, False, {}),
     )
     with pytest.raises(ValueError, match=r"source.*reward"):
-        made.loop.watch(made)
+        made.loop.learn_deferred(made)
 
 
 @pytest.mark.slow
 def test_a_policy_is_rehearsed_where_a_log_was_traced_and_no_step_of_the_budget_is_spent_on_it() -> None:
     measured = Measurements.from_replay(filled([]).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured, close_loop=False, model_train_freq=1).learn(60, source_timesteps=0)
-    assert made.loop is not None
     assert made.loop.found[-1]["verdict"] == "complete"
-    assert made.loop.rehearsals.steps > 0
+    assert made.loop.selection.steps > 0
     assert made.num_timesteps == 60
 
 
@@ -1583,9 +1535,8 @@ def test_a_policy_that_stays_is_not_sent_to_learn_in_the_corrected_simulator(
     soon: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = filled(friction(), cls=RTO)
-    monkeypatch.setattr(Rounds, "learn", lambda *_: pytest.fail("RTO does not move the policy"))
-    assert made.loop is not None
-    made.loop.close(made, dynamics(made))
+    monkeypatch.setattr(Retraining, "learn", lambda *_: pytest.fail("RTO does not move the policy"))
+    made.loop.trace_transitions(made, dynamics(made))
     assert "coulomb_friction(slider).level" in dynamics(made).names
 
 
@@ -1595,11 +1546,10 @@ def test_a_budget_that_ends_before_the_first_trace_is_told(monkeypatch: pytest.M
         made.learn(50, source_timesteps=0)
     with pytest.warns(UserWarning, match="waits 150 target steps"):
         made.learn(50, reset_num_timesteps=False)
-    monkeypatch.setattr(controller, "FIRST", 120)
+    change(monkeypatch, first_trace=120)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert made.loop is not None
-        assert made.loop.first_comes_after(made) == 20
+        assert made.loop.first_trace_after(made) == 20
         arguments.check_ready(made, 20, None)
 
 
@@ -1614,22 +1564,21 @@ def test_the_first_trace_waits_for_a_fit() -> None:
 
 def test_what_is_owed_is_owed_to_a_run_that_counts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     made = judged(monkeypatch)
-    made.learn(20, reset_num_timesteps=False, callback=lambda *_: made._owed < 10)
+    made.learn(20, reset_num_timesteps=False, callback=lambda *_: made.state.deferred_target_steps < 10)
     updates = made._n_updates
     made.learn(30)
-    assert (made._n_updates - updates, made._owed) == (40, 0)
+    assert (made._n_updates - updates, made.state.deferred_target_steps) == (40, 0)
 
 
 @pytest.mark.slow
 def test_a_target_after_its_log_begins_anew(soon: None) -> None:
     measured = Measurements.from_replay(filled(friction()).replay_buffer, gym.make(TASK))
     made = model([], target_data=measured).learn(40, source_timesteps=0)
-    assert made.loop is not None
-    assert made.loop.accounts
+    assert made.loop.simulator_validated
     made.take_snapshot("learner")
     with pytest.warns(UserWarning, match=r"D_target loses \d+ transitions of the log, whose states are estimates"):
         made.set_target_env(target(friction()))
-    assert (made.replay_buffer.target.size(), made.loop.accounts) == (0, False)
+    assert (made.replay_buffer.target.size(), made.loop.simulator_validated) == (0, False)
     assert "learner" not in made.snapshots
     made.learn(130)
     assert [found["verdict"] for found in made.loop.found] == ["explained", "explained"]
@@ -1686,13 +1635,12 @@ def test_a_target_after_a_log_begins_without_the_logs_estimates(
 
 def test_a_rehearsal_that_was_interrupted_is_played_again(monkeypatch: pytest.MonkeyPatch) -> None:
     made = forgetful()
-    assert made.loop is not None
     made._n_updates += 10
     with monkeypatch.context() as patch:
-        patch.setattr(made.loop.rehearsals, "_play", interrupt)
+        patch.setattr(made.loop.selection, "play", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            made.loop.rehearse(made)
-    assert made.loop.rehearsals.is_behind(made)
+            made.loop.selection.evaluate(made, dynamics(made))
+    assert made.loop.selection.is_behind(made)
 
 
 def interrupt(*_: object) -> np.ndarray:
@@ -1700,11 +1648,10 @@ def interrupt(*_: object) -> np.ndarray:
 
 
 def test_rounding_alone_is_no_reason_for_another_trace(soon: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(controller, "AGAIN", 20)
+    change(monkeypatch, next_trace=20)
     made = filled([], 120)
-    assert made.loop is not None
-    made.loop._traced_at, made.loop._error, made.loop.found = 80, 1e-12, [{"verdict": "complete"}]
+    made.loop.traced_at, made.loop.traced_error, made.loop.found = 80, 1e-12, [{"verdict": "complete"}]
     monkeypatch.setattr(PhysicalDynamics, "error", lambda *_: 5e-12)
-    assert not made.loop.due(made, dynamics(made))
+    assert not made.loop.trace_due(made, dynamics(made))
     monkeypatch.setattr(PhysicalDynamics, "error", lambda *_: 5e-3)
-    assert made.loop.due(made, dynamics(made))
+    assert made.loop.trace_due(made, dynamics(made))

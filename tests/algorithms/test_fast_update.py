@@ -11,14 +11,12 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
 from sb3_rpto import RPO, RTO
-from sb3_rpto.algorithms.fast_update import WrittenUpdate, are_usual
-from sb3_rpto.algorithms.fused_optimizer import Descent
-from sb3_rpto.algorithms.update import Descents
+from sb3_rpto.algorithms.fast_update import ManualUpdate, OptimizerStep, OptimizerSteps, supports_manual_gradients
 
 widths = st.lists(st.integers(1, 9), min_size=1, max_size=3)
 
 
-class Recorded(Descent):
+class Recorded(OptimizerStep):
     """Keeps the gradients instead of stepping down them."""
 
     def step(self, gradients):
@@ -34,12 +32,12 @@ def batch(n: int, seed: int) -> ReplayBufferSamples:
 
 def recorded(model, update):
     """Losses and gradients of one update that moves nothing."""
-    descents = Descents(*(Recorded(o) for o in (model.actor.optimizer, model.critic.optimizer)))
+    steps = OptimizerSteps(*(Recorded(o) for o in (model.actor.optimizer, model.critic.optimizer)))
     if model.ent_coef_optimizer is not None:
-        descents = descents._replace(ent_coef=Recorded(model.ent_coef_optimizer))
+        steps = steps._replace(ent_coef=Recorded(model.ent_coef_optimizer))
     th.manual_seed(5)
-    losses = update(batch(20, 0), batch(11, 1), descents)
-    return losses, [getattr(descent, "gradients", None) for descent in descents if descent is not None]
+    losses = update(batch(20, 0), batch(11, 1), steps)
+    return losses, [getattr(step, "gradients", None) for step in steps if step is not None]
 
 
 @given(
@@ -55,11 +53,17 @@ def test_losses_and_gradients_are_autograds(actor, critic, n_critics, ent_coef, 
     model = small(cls, policy_kwargs=arch, ent_coef=ent_coef)
     model.policy.double()
     model.actor.log_std.bias.data += log_std  # within SB3's bounds, at one, or beyond one
-    assert are_usual(model)
+    assert supports_manual_gradients(model.policy)
     with pytest.MonkeyPatch.context() as patch:  # SB3 would make float32 of the observations
         patch.setattr(policies, "preprocess_obs", lambda obs, *_, **__: obs)
         losses, gradients = recorded(model, model.update_once)
-    written_losses, written = recorded(model, WrittenUpdate(model))
+    manual = ManualUpdate(model.policy, model.log_ent_coef, model.target_entropy, model.gamma)
+
+    def without_autograd(critic_batch, actor_batch, steps):
+        learned_from = actor_batch if model.policy_learns else None
+        return manual(critic_batch, learned_from, model.temperature(), steps)
+
+    written_losses, written = recorded(model, without_autograd)
     assert losses.keys() == written_losses.keys()
     for name, loss in losses.items():
         th.testing.assert_close(written_losses[name].reshape(()), loss.detach().reshape(()))
@@ -100,9 +104,9 @@ def _turned(model):
 @pytest.mark.parametrize("change", [_freeze, _hook, _gradient_hook, _accumulated_hook, _own_layer, _turned])
 def test_networks_that_were_changed_go_through_autograd(change):
     model = small(RPO)
-    assert are_usual(model)
+    assert supports_manual_gradients(model.policy)
     change(model)
-    assert not are_usual(model)
+    assert not supports_manual_gradients(model.policy)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +121,7 @@ def test_networks_that_were_changed_go_through_autograd(change):
 )
 def test_other_networks_go_through_autograd_and_learn(kwargs):
     model = small(RPO, **kwargs)
-    assert not are_usual(model)
+    assert not supports_manual_gradients(model.policy)
     before = next(model.actor.mu.parameters()).detach().clone()
     model.learn(64, source_timesteps=0)
     assert not th.equal(before, next(model.actor.mu.parameters()))

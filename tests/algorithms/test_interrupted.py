@@ -50,7 +50,7 @@ def test_an_interrupted_fit_is_made_again_and_no_update_twice(cls, monkeypatch):
     assert fits == [41, 61]
     assert model.replay_buffer.target.size() == 65
     if cls is PDML:
-        assert sum(block.size for block in model.blocks) + model._since_block == 65
+        assert sum(block.size for block in model.blocks) + model.steps_since_block == 65
 
 
 def test_an_error_network_that_was_interrupted_is_fitted(monkeypatch):

@@ -18,7 +18,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms import warm_start
+from sb3_rpto.algorithms import pretraining
 from sb3_rpto.buffers import chronological
 
 
@@ -98,13 +98,13 @@ def test_a_fresh_model_trains_in_the_source_first_and_once(cls):
     target = CountingPendulum(pendulum(12.0))
     model = small(cls, target=target)
     model.learn(10, callback=Count(), source_timesteps=150)
-    assert model._pretrained_steps == 150
+    assert model.state.pretraining_timesteps == 150
     assert calls == list(range(1, 11))
     assert target.steps == 10
     before = model.source_timesteps
     model.learn(10, reset_num_timesteps=False, source_timesteps=150)
     assert model.source_timesteps - before == 10 * 8
-    assert model._pretrained_steps == 150
+    assert model.state.pretraining_timesteps == 150
 
 
 def test_the_source_phase_is_plain_sac():
@@ -234,7 +234,7 @@ def test_the_source_phase_is_ten_times_the_budget_and_has_an_end(budget, steps, 
         asked.append(source_timesteps)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(RPO, "begin_in_source", stop)
+    monkeypatch.setattr(RPO, "prepare_in_source", stop)
     with pytest.raises(KeyboardInterrupt):
         small(RPO).learn(budget)
     assert asked == [steps]
@@ -271,7 +271,7 @@ class Better(gym.Wrapper):
 @pytest.mark.parametrize(("by", "best"), [(1, 5 * (4 + 5 + 6 + 7 + 8) / 5), (-1, -5 * (1 + 2 + 3 + 4 + 5) / 5)])
 def test_the_newest_episodes_judge(by, best):
     model = small(RPO, target=Better(by)).learn(40, source_timesteps=0)
-    assert model.best_mean_reward == pytest.approx(best)
+    assert model.snapshots.best_mean_reward == pytest.approx(best)
 
 
 def test_the_worlds_have_starts_of_their_own():
@@ -285,7 +285,7 @@ def test_the_best_policy_is_kept_and_can_be_brought_back():
     model = small(RPO, target=gym.make("Pendulum-v1", g=12.0, max_episode_steps=20))
     model.learn(120, source_timesteps=0)
     assert set(model.snapshots) == {"source", "best"}
-    assert np.isfinite(model.best_mean_reward)
+    assert np.isfinite(model.snapshots.best_mean_reward)
     now = model.predict(np.ones(3), deterministic=True)[0]
     assert model.temperature() != 1.0
     model.rollback("source")
@@ -475,7 +475,7 @@ def test_the_budget_of_source_steps_is_not_exceeded():
     ],
 )
 def test_every_target_step_is_matched_with_so_many_source_steps(sources, targets, train_freq, budgets, monkeypatch):
-    monkeypatch.setattr(warm_start, "FIRST_SOURCE_STEPS", 0)
+    monkeypatch.setattr(pretraining, "FIRST_SOURCE_STEPS", 0)
     env = make_vec_env(pendulum, n_envs=sources)
     target = make_vec_env(lambda: gym.make("Pendulum-v1", g=12.0, max_episode_steps=20), n_envs=targets)
     model = small(RPO, env, target, train_freq=train_freq, source_steps=4)
@@ -541,7 +541,7 @@ def test_the_source_phase_keeps_more_than_the_transfer_does():
     model = small(RPO, buffer_size=40)
     model.learn(3, source_timesteps=90)
     assert model.replay_buffer.source.size() == 40
-    assert model._pretrained_steps == 90
+    assert model.state.pretraining_timesteps == 90
     model = small(RPTO, buffer_size=40)
     model.learn(3, source_timesteps=90)
     assert len(model.replay_buffer.source_starts) == PHI_0_STEPS  # the phase's 90 and as many more as phi_0 wants

@@ -21,7 +21,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import configure
 
 from sb3_rpto import RPTO, RTO
-from sb3_rpto.algorithms.closed_loop import controller, source_buffer
+from sb3_rpto.algorithms.closed_loop import controller
+from sb3_rpto.algorithms.closed_loop.controller import ClosedLoop
 from sb3_rpto.algorithms.offline_target import check_log, transitions
 from sb3_rpto.buffers import chronological
 from sb3_rpto.dynamics.physical import PhysicalDynamics
@@ -326,7 +327,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def quick(patch: pytest.MonkeyPatch) -> None:
     """Few windows and long steps in time: a trace of some seconds."""
-    patch.setattr(source_buffer, "FILL", 50)
+    patch.setattr(ClosedLoop, "settings", replace(ClosedLoop.settings, fill_steps=50))
     settings = Settings(problem=ProblemSettings(longest_step=0.005, few_windows=8))
     patch.setitem(trace.__kwdefaults__, "settings", settings)
 
@@ -335,7 +336,7 @@ def quick(patch: pytest.MonkeyPatch) -> None:
 def learned() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         quick(patch)
-        return model(log(pushed=True), close_loop=["torque_offset"]).learn(40, source_timesteps=20)
+        return model(log(pushed=True), close_loop=True, effects=["torque_offset"]).learn(40, source_timesteps=20)
 
 
 def test_what_the_log_shows_joins_phi() -> None:
@@ -345,7 +346,7 @@ def test_what_the_log_shows_joins_phi() -> None:
     values = made.dynamics.describe()
     assert values["torque_offset(slider).offset"] == pytest.approx(OFFSET, rel=0.03)
     assert values["hinge.damping"] == pytest.approx(DAMPING, rel=0.1)
-    assert "torque_offset(slider)" in [effect.label for effect in made._source_world.copies[0].effects]
+    assert "torque_offset(slider)" in [effect.label for effect in made.rollouts.copies[0].effects]
 
 
 def test_what_the_trace_left_open_is_what_episodes_differ_by(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -369,7 +370,7 @@ def test_what_does_not_explain_a_log_joins_phi_where_it_helps_at_all(
     after = dataclasses.replace(report.adequacy_before, ratio=ratio * report.adequacy_before.ratio)
     unexplained = dataclasses.replace(report, verdict="unexplained", adequacy_after=after)
     monkeypatch.setattr(controller, "trace", lambda *_, **__: unexplained)
-    made = model(log(pushed=True), RTO, close_loop=["torque_offset"])
+    made = model(log(pushed=True), RTO, close_loop=True, effects=["torque_offset"])
     with pytest.warns(UserWarning, match="the trace on 5 recorded episodes is 'unexplained'"):
         made.learn(40, source_timesteps=0)
     assert ("torque_offset(slider).offset" in made.dynamics.names) == joins
@@ -386,7 +387,7 @@ def test_what_a_log_does_not_tell_is_said_and_phi_is_logged(
     ]
     report = dataclasses.replace(learned().loop.reports[0], verdict=verdict, findings=vague)
     monkeypatch.setattr(controller, "trace", lambda *_, **__: report)
-    made = model(log(pushed=True), RTO, close_loop=["torque_offset"])
+    made = model(log(pushed=True), RTO, close_loop=True, effects=["torque_offset"])
     made.set_logger(configure(str(tmp_path), ["csv"]))
     with pytest.warns(UserWarning, match="these data do not tell it") as said:
         made.learn(10, source_timesteps=0)
@@ -403,7 +404,7 @@ def test_source_steps_are_counted_and_old_ones_dropped() -> None:
     made = learned()
     assert made.num_timesteps == 40
     assert 50 + 40 <= made.replay_buffer.source.size() <= made.source_timesteps - 100
-    assert made.dynamics.error(made.transitions("source")) < source_buffer.OTHER
+    assert made.dynamics.error(made.transitions("source")) < ClosedLoop.settings.foreign_error
 
 
 def test_the_zip_holds_what_was_found_and_not_the_log(tmp_path: Path) -> None:
@@ -431,7 +432,9 @@ def test_a_log_that_corrects_the_simulator_alone_is_not_asked_for_again(tmp_path
     measured = log(pushed=True)
     fallen = [replace(episode, qpos=episode.qpos + np.array([0, 0.6])) for episode in measured.episodes]
     with pytest.warns(UserWarning, match="learns there alone"):
-        made = model(replace(measured, episodes=fallen), close_loop=["torque_offset"]).learn(20, source_timesteps=20)
+        made = model(replace(measured, episodes=fallen), close_loop=True, effects=["torque_offset"]).learn(
+            20, source_timesteps=20
+        )
     made.save(tmp_path / "model")
     loaded = RPTO.load(tmp_path / "model", env=gym.make(TASK), device="cpu")
     assert loaded.learn(20, reset_num_timesteps=False).num_timesteps == 40
@@ -460,5 +463,5 @@ def test_networks_learn_from_a_log() -> None:
     size = made.replay_buffer.target.size()
     assert size == 5 * 26
     made.learn(40, source_timesteps=0)
-    assert made.loop is None
+    assert not made.loop.closed
     assert made.replay_buffer.target.size() == size

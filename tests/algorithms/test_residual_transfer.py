@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sb3_rpto import RPTO
-from sb3_rpto.algorithms import warm_start
+from sb3_rpto.algorithms import pretraining
 from sb3_rpto.dynamics.residual import ResidualDynamics
 from sb3_rpto.effects import LIBRARY, declare
 from sb3_rpto.envs.corrected import apply_effects
@@ -46,7 +46,7 @@ def test_a_simulator_that_needs_no_fit_takes_few_source_steps_to_begin_with(monk
         dynamics_kwargs={"threads": 1, "ensemble_kwargs": TINY},
         **{"seed": 0, "device": "cpu", "gradient_steps": 0, "source_steps": 2, "model_train_freq": 60},
     )
-    monkeypatch.setattr(warm_start, "FIRST_SOURCE_STEPS", 40)
+    monkeypatch.setattr(pretraining, "FIRST_SOURCE_STEPS", 40)
     made.learn(1, source_timesteps=0)
     assert len(made.replay_buffer.source_starts) == 40
 

@@ -205,7 +205,7 @@ def simulators(randomise: float) -> RPTO:
 
 def masses(made: RPTO, n_steps: int = 400) -> tuple[list[set[float]], float]:
     """Of each simulator those of all of its episodes, and the estimate."""
-    world, seen = made._source_world, [set[float](), set[float]()]
+    world, seen = made.rollouts, [set[float](), set[float]()]
     for _ in range(n_steps // 2):
         world.interact(made, 2)  # type: ignore[union-attr]
         for copy, of in zip(world.copies, seen):  # type: ignore[union-attr]

@@ -37,7 +37,7 @@ from stable_baselines3.sac.policies import SACPolicy
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms import warm_start
+from sb3_rpto.algorithms import pretraining
 from sb3_rpto.algorithms.rollouts import EpisodeSource
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 
@@ -54,9 +54,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:EnsembleDynamics learns terminat
 
 @pytest.fixture(autouse=True)
 def _shortest_source_phase(_short_source_phase, monkeypatch):
-    monkeypatch.setattr(warm_start, "PHI_0_STEPS", 20)
-    monkeypatch.setattr(warm_start, "PHI_0_UPDATES", 3)
-    monkeypatch.setattr(warm_start, "FIRST_SOURCE_STEPS", 20)
+    monkeypatch.setattr(pretraining, "PHI_0_STEPS", 20)
+    monkeypatch.setattr(pretraining, "PHI_0_UPDATES", 3)
+    monkeypatch.setattr(pretraining, "FIRST_SOURCE_STEPS", 20)
 
 
 class Drift(gym.Env):
@@ -843,7 +843,8 @@ def test_a_callbacks_checkpoint_resumes_as_if_never_stopped(cls, normalise, save
     learn(resumed, 34 - saved_at, reset_num_timesteps=False)
     assert resumed.num_timesteps == resumed.replay_buffer.size() == 34
     assert resumed.target_spent == {"learning": 34}
-    for name in ("_n_updates", "_episode_num", "source_timesteps", "_actor_updates", "_since_fit"):
+    assert resumed.state == unbroken.state
+    for name in ("_n_updates", "_episode_num"):
         assert getattr(resumed, name) == getattr(unbroken, name), name
     for side in ("source", "target"):
         for name in ("observations", "next_observations", "actions", "rewards"):
@@ -1217,9 +1218,9 @@ def test_weighing_transitions_leaves_the_networks_statistics(cls):
     model = learn(build(cls, **settings), 20)
     model.train(1, 8)
     before = batch_norm(model.actor).running_mean.clone()
-    model._since_fit = 1000
-    model.fit_dynamics()
-    model.interact_with_source()
+    model.state.steps_since_fit = 1000
+    model.update_dynamics()
+    model.collect_source()
     assert th.equal(before, batch_norm(model.actor).running_mean)
 
 

@@ -31,7 +31,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples, TrainFreq
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 from sb3_rpto import RPO, RPTO, DualReplayBuffer, DynamicsEnv
-from sb3_rpto.algorithms import warm_start
+from sb3_rpto.algorithms import pretraining
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 
 SAC_DEFAULTS = {
@@ -69,9 +69,9 @@ ours = pytest.mark.parametrize("cls", OURS)
 
 @pytest.fixture(autouse=True)
 def _shortest_source_phase(_short_source_phase, monkeypatch):
-    monkeypatch.setattr(warm_start, "PHI_0_STEPS", 20)
-    monkeypatch.setattr(warm_start, "PHI_0_UPDATES", 3)
-    monkeypatch.setattr(warm_start, "FIRST_SOURCE_STEPS", 20)
+    monkeypatch.setattr(pretraining, "PHI_0_STEPS", 20)
+    monkeypatch.setattr(pretraining, "PHI_0_UPDATES", 3)
+    monkeypatch.setattr(pretraining, "FIRST_SOURCE_STEPS", 20)
 
 
 def sac(env=None, **kwargs):
@@ -152,7 +152,7 @@ def test_load_ends_by_set_parameters_with_exact_match(tmp_path, monkeypatch):
         "set_parameters",
         lambda self, params, exact_match=True, device="auto": (calls.append(exact_match), put(self, params)),
     )
-    assert RPO.load(tmp_path / "model")._warm is False
+    assert RPO.load(tmp_path / "model").state.knows_source is False
     assert calls == [True]
 
 
@@ -214,7 +214,7 @@ def test_sb3_leaves_out_what_cannot_be_pickled(cls):
     excluded = set(BaseAlgorithm._excluded_save_params(build(cls)))
     assert excluded >= {"policy", "device", "env", "replay_buffer", "_vec_normalize_env", "_logger"}
     ours_too = set(build(cls)._excluded_save_params())
-    assert ours_too >= excluded | {"actor", "critic", "critic_target", "target_env", "dynamics", "_last_obs"}
+    assert ours_too >= excluded | {"actor", "critic", "critic_target", "target", "dynamics", "_last_obs"}
 
 
 def test_sb3_reads_what_ends_in_pth_and_leaves_other_entries_alone(tmp_path):
@@ -267,7 +267,7 @@ def test_our_update_draws_one_for_each_gathered_at_once(monkeypatch):
         "sample",
         lambda n, env=None, world="target": (worlds.append((n, world)), sample(n, env=env, world=world))[1],
     )
-    model._actor_updates = 3
+    model.state.actor_updates = 3
     model.real_ratio = 0.25
     model.train(gradient_steps=2, batch_size=8)
     assert sorted(worlds) == [(4, "target"), (8, "source"), (8, "target"), (12, "source")]

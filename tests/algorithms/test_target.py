@@ -241,8 +241,8 @@ def test_another_simulator_in_the_place_of_the_source_is_told(tmp_path: Any) -> 
 def test_episodes_of_the_simulator_are_counted_without_a_monitor() -> None:
     made = simulated(VecNormalize(DummyVecEnv([lambda: gym.make(POLE)])))
     made.learn(10, source_timesteps=50)
-    assert made._source_world is not None
-    assert made._source_world.log()["ep_rew_mean"] > 0
+    assert made.rollouts is not None
+    assert made.rollouts.log()["ep_rew_mean"] > 0
 
 
 def test_the_cart_poles_preset_is_for_cart_poles() -> None:
@@ -298,7 +298,9 @@ def test_another_optimizer_begins_anew(optimizer: type[th.optim.Optimizer]) -> N
     made.learn(10)
 
 
-@pytest.mark.parametrize("name", ["close_loop", "declared", "dynamics_kwargs", "preset", "use_sde", "n_steps"])
+@pytest.mark.parametrize(
+    "name", ["close_loop", "effects", "declared", "dynamics_kwargs", "preset", "use_sde", "n_steps"]
+)
 def test_loading_refuses_what_it_cannot_change(name: str, tmp_path: Any) -> None:
     simulated(gym.make(POLE)).save(tmp_path / "model.zip")
     with pytest.raises(ValueError, match=rf"load\(\) does not change {name}"):

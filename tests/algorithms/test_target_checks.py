@@ -159,7 +159,7 @@ def test_what_fits_is_not_doubted():
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="after the fit")
         made = model(shifted()).learn(45, source_timesteps=0)
-    assert made._judged_target
+    assert made.state.fit_checked
 
 
 class Fragile(gym.Wrapper):

@@ -102,7 +102,7 @@ def test_a_resumed_source_phase_still_notices_a_target_equal_to_the_source(cls, 
 def test_the_null_shift_check_ends():
     model = small(RPO, short(10.0), short(12.0))
     model.learn(3, source_timesteps=0)
-    assert model._null_check is None
+    assert model.target.null_shift is None
 
 
 def test_a_target_in_the_place_of_another_one_is_checked_anew():
@@ -138,12 +138,14 @@ def test_action_noise_takes_the_width_of_the_target(widths):
 def test_the_best_policy_of_a_target_is_judged_by_its_own_episodes():
     model = small(RPO, short(10.0), gym.wrappers.TransformReward(short(12.0), lambda r: 0.01 * r))
     model.learn(140, source_timesteps=0)
-    assert np.isfinite(model.best_mean_reward)
+    assert np.isfinite(model.snapshots.best_mean_reward)
     with pytest.warns(UserWarning, match="D_target loses"):
         model.set_target_env(short(12.0))
     model.learn(140, reset_num_timesteps=False)
     earned = [info["r"] for info in model.ep_info_buffer]
-    assert model.best_mean_reward == pytest.approx(max(np.mean(earned[i : i + 5]) for i in range(len(earned) - 4)))
+    assert model.snapshots.best_mean_reward == pytest.approx(
+        max(np.mean(earned[i : i + 5]) for i in range(len(earned) - 4))
+    )
 
 
 def test_steps_that_a_script_takes_in_the_target_are_counted_at_once():
@@ -196,17 +198,17 @@ def test_a_step_of_the_target_that_was_interrupted_is_no_somebody_elses():
 
 def stop_at(model, steps):
     """Ctrl-C in the update after so many target steps, each of which is stored by then."""
-    update = model.update
+    update = model.update_policy
 
     def interrupted():
         if model.num_timesteps == steps:
             raise KeyboardInterrupt
         update()
 
-    model.update = interrupted
+    model.update_policy = interrupted
     with pytest.raises(KeyboardInterrupt):
         model.learn(100, source_timesteps=0)
-    del model.update
+    del model.update_policy
 
 
 @pytest.mark.parametrize("other", [False, True])

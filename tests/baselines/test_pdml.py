@@ -66,7 +66,7 @@ def with_blocks(target_size: int, collected: int):
     """Blocks of 3 and 2 target steps, and 2 since; the shares are 0.2 and 0.8."""
     model = small(PDML, replay_buffer_kwargs={"target_size": target_size})
     model.learn(collected, source_timesteps=0)
-    model.blocks, model.shares, model._since_block = [Block(3, {}), Block(2, {})], np.array([0.2, 0.8]), 2
+    model.blocks, model.shares, model.steps_since_block = [Block(3, {}), Block(2, {})], np.array([0.2, 0.8]), 2
     return model
 
 

@@ -145,7 +145,7 @@ def test_a_checkpoint_keeps_the_error_network(tmp_path):
     for name, value in model.errors.state_dict().items():
         assert th.equal(value, loaded.errors.state_dict()[name]), name
     assert loaded.errors.optimizer.state_dict()["state"]
-    assert isinstance(loaded._make_source_world(), ForeseenBranches)
+    assert isinstance(loaded.make_rollouts(), ForeseenBranches)
 
 
 def test_numbers_are_the_papers_and_must_be_positive():

@@ -303,7 +303,7 @@ def test_a_discount_holds_for_returns_of_several_steps_too(tmp_path: Path) -> No
 
 
 def test_fresh_source_transitions_are_as_many_as_they_cost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sac_variants.warm_start, "PHI_0_STEPS", 90)
+    monkeypatch.setattr(sac_variants.pretraining, "PHI_0_STEPS", 90)
     SAC("MlpPolicy", cartpole(), policy_kwargs=SMALL_POLICY, buffer_size=30, device="cpu").save(tmp_path / "sac.zip")
     found, spent = sac_variants.source_transitions(tmp_path / "sac.zip", cartpole(), 0)
     assert len(found["rewards"]) == spent == 90

@@ -12,7 +12,6 @@ from benchmarks.closed_loop import study as study
 from benchmarks.tracing import targets
 from benchmarks.tracing.targets import RUNS, Job, first_transitions, noisy_log, run
 from benchmarks.transfer.sources import FOLDER_VARIABLE
-from sb3_rpto.algorithms.closed_loop.controller import FIRST
 from sb3_rpto.sysid.findings import FindingKind
 
 
@@ -28,7 +27,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_first_transitions_are_the_targets_and_follow_from_the_seed(folder: Path) -> None:
     first, again, other = (first_transitions(Job("double-pendulum", "declared", 0, s), folder) for s in (0, 0, 1))
     # Of n transitions in e episodes n + e samples are made.
-    assert sum(map(len, first.episodes)) <= FIRST + len(first.episodes)
+    assert sum(map(len, first.episodes)) <= targets.FIRST + len(first.episodes)
     assert first.exact
     starts = [m.episodes[0].qpos[0].tolist() for m in (first, again, other)]
     assert starts[0] == starts[1] != starts[2]

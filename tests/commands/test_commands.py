@@ -227,7 +227,14 @@ def test_a_closed_loop_leaves_its_report_and_the_corrected_simulator(
     SAC("MlpPolicy", gym.make("InvertedDoublePendulum-v5"), policy_kwargs=small, seed=0, device="cpu").save(
         tmp_path / "agent.zip"
     )
-    closed = ["dynamics=physical", "close_loop=[link_length]", "retrain_steps=16", "source_steps=1", "gradient_steps=1"]
+    closed = [
+        "dynamics=physical",
+        "close_loop=true",
+        "effects=[link_length]",
+        "retrain_steps=16",
+        "source_steps=1",
+        "gradient_steps=1",
+    ]
     given = [str(tmp_path / "agent.zip"), "rpto/InvertedDoublePendulum-limb-x2-v0", "--steps", "200", "--every", "100"]
     settings = [text for setting in closed for text in ("--set", setting)]
     out = tmp_path / "run"

@@ -231,6 +231,6 @@ def test_an_environment_is_asked_for_what_effects_need_of_it(robot, kind, said):
 def test_what_a_trace_could_not_add_is_refused_before_a_target_step():
     """Else it is learned once the steps are spent and traced."""
     settings = {"dynamics": "physical", "declared": ["pole.length"], "policy_kwargs": {"net_arch": [4]}}
-    with pytest.raises(ValueError, match=r"close_loop=True: .*could not act in it.*or pass close_loop=\[\.\.\.\] with"):
+    with pytest.raises(ValueError, match=r"effects='all': .*could not act in it.*or pass effects=\[\.\.\.\] with"):
         RPTO("MlpPolicy", Direct(), target_env=gym.make(POLE), close_loop=True, **settings)
-    RPTO("MlpPolicy", Direct(), target_env=gym.make(POLE), close_loop=["viscous_friction"], **settings)
+    RPTO("MlpPolicy", Direct(), target_env=gym.make(POLE), close_loop=True, effects=["viscous_friction"], **settings)

@@ -13,9 +13,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_rpto import RPO, RPTO, RTO
-from sb3_rpto.algorithms.fast_forward import sample_actions
-from sb3_rpto.algorithms.fused_optimizer import Descent
-from sb3_rpto.algorithms.update import ALTERNATION, GATHERED
+from sb3_rpto.algorithms.batches import ALTERNATION, GATHERED
+from sb3_rpto.algorithms.fast_update import OptimizerStep
+from sb3_rpto.algorithms.losses import sample_actions
 from sb3_rpto.dynamics.base import Transitions
 from sb3_rpto.dynamics.weights import rto_weights
 
@@ -191,7 +191,7 @@ def test_what_does_not_fit_is_gathered_in_parts(monkeypatch):
 def test_adam_with_options_of_the_users_steps_as_it_is():
     weights = [th.nn.Parameter(th.tensor([1.0, -2.0])) for _ in range(2)]
     theirs, ours = (th.optim.Adam([w], lr=0.1, amsgrad=True) for w in weights)
-    descend = Descent(ours)
+    descend = OptimizerStep(ours)
     for step in range(5):
         theirs.zero_grad()
         ((step - 2) * weights[0].square()).sum().backward()
