@@ -25,6 +25,7 @@ from sb3_rpto.sysid.data.encoder_offsets import EncoderOffsets
 from sb3_rpto.sysid.findings import FindingKind
 from sb3_rpto.sysid.problem.contacts import contact_changes
 from sb3_rpto.sysid.selection.adequacy import SETTLED
+from sb3_rpto.sysid.settings import DEFAULTS
 from sb3_rpto.sysid.shooting.windows import noise_levels
 
 #: Findings that say what would account for the target in place of effects.
