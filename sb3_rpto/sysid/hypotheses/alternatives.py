@@ -11,7 +11,7 @@ from sb3_rpto.sysid.hypotheses.encoder_offsets import OffsetsOfRuns
 from sb3_rpto.sysid.hypotheses.finer_steps import FinerSteps
 from sb3_rpto.sysid.hypotheses.held_forces import HeldForces
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis
-from sb3_rpto.sysid.hypotheses.simulated_data import ExactStates, SimulatorSteps, SimulatorSubsteps
+from sb3_rpto.sysid.hypotheses.simulated_data import ExactStates, OtherSubsteps, SimulatorSteps, SimulatorSubsteps
 from sb3_rpto.sysid.hypotheses.soft_friction import SoftFriction
 from sb3_rpto.sysid.hypotheses.undeclared_mass import UndeclaredMass
 from sb3_rpto.sysid.hypotheses.unlikely_data import UnlikelyData
@@ -22,10 +22,13 @@ from sb3_rpto.sysid.selection.search import SearchResult
 #: How runs are judged on.
 _JUDGING: tuple[Hypothesis, ...] = (BlocksOfAllRuns(),)
 #: Which forces act.
-_FORCES: tuple[Hypothesis, ...] = (SoftFriction(_JUDGING), HeldForces(_JUDGING))
+_SOFT, _HELD = SoftFriction(_JUDGING), HeldForces(_JUDGING)
+_FORCES: tuple[Hypothesis, ...] = (_SOFT, _HELD)
 #: Where the recordings come from.
-_ORIGIN: tuple[Hypothesis, ...] = tuple(
-    kind((*_JUDGING, *_FORCES)) for kind in (SimulatorSubsteps, SimulatorSteps, ExactStates)
+_ORIGIN: tuple[Hypothesis, ...] = (
+    SimulatorSubsteps((*_JUDGING, _SOFT, OtherSubsteps(), _HELD)),
+    SimulatorSteps((*_JUDGING, *_FORCES)),
+    ExactStates((*_JUDGING, *_FORCES)),
 )
 #: What gives hints alone.
 _HINTS: tuple[Hypothesis, ...] = (UnlikelyData(), ColumnErrors(), UndeclaredMass(), FinerSteps())

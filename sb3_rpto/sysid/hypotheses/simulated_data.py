@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis, kept_effects
 from sb3_rpto.sysid.problem.data_origin import are_exact_states, find_origin, may_be_exact
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
-from sb3_rpto.sysid.selection.search import SearchResult
+from sb3_rpto.sysid.selection.search import SearchResult, SelectorPair, search_on
 
 #: What was assumed of friction and of kinds is asked anew where the recordings are of another origin.
 ANEW = {"kinds": None, "soft_friction": False}
@@ -35,6 +37,44 @@ class SimulatorSubsteps(Hypothesis):
             "continuous motion does"
         )
         return Finding(FindingKind.SIMULATED, "fitted runs", message)
+
+
+class OtherSubsteps(Hypothesis):
+    """They are of steps of another length than those that seemed to meet them best before anything was found.
+
+    What was still missing then may have led that choice astray, such as friction that gives way near rest.
+    """
+
+    def applies(self, problem: IdentificationProblem, result: SearchResult) -> bool:
+        """Where something was found in a simulator's steps."""
+        return problem.data.simulated and bool(result.selection.model.effects)
+
+    def alternative(self, problem: IdentificationProblem, result: SearchResult) -> IdentificationProblem | None:
+        """The recordings in the steps that meet them best with what was found; None where they are read so already."""
+        settings, found = problem.settings.selection, result.selection.model
+        best, least = None, -np.log(1 - settings.substeps_gain)
+        for substeps in settings.substeps:
+            if substeps == problem.data.substeps:
+                continue
+            problem.inputs.say(0.0, "judging in a simulator's own steps")
+            other = problem.assuming(substeps=substeps)
+            windows = SelectorPair.on(other, result.on.horizon, result.on.settings).fine
+            begin = windows.train.score(found.fit.values)
+            fitted = windows.fit_model(found.effects, begin, iterations=settings.substeps_iterations)
+            saved = -float(np.mean(np.log(fitted.fit.errors / found.fit.errors)))
+            if saved > least:
+                best, least = other, saved
+        return best
+
+    def search(
+        self, alternative: IdentificationProblem, result: SearchResult
+    ) -> tuple[IdentificationProblem, SearchResult]:
+        """The search goes on from what was found."""
+        return alternative, search_on(alternative, result)
+
+    def accepts(self, result: SearchResult, alternative: SearchResult) -> bool:
+        """Where they explain as well."""
+        return alternative.explains or not result.explains
 
 
 class SimulatorSteps(Hypothesis):

@@ -165,6 +165,21 @@ def search(problem: IdentificationProblem) -> SearchResult:
     return SearchResult(on, base, before, screening, selection, after, substeps)
 
 
+def search_on(problem: IdentificationProblem, result: SearchResult) -> SearchResult:
+    """Go on from a result on another reading of the same windows, with the same candidates.
+
+    :param problem: the recordings as they are read now
+    :param result: of the search on them as they were read before
+    """
+    seed = problem.inputs.seed
+    on = SelectorPair.on(problem, result.on.horizon, result.on.settings)
+    base = on.fine.fit_model((), on.fine.train.score(result.base.fit.values), iterations=10)
+    screening = screen(on.fine.train, nominal_at_bounds(on.fine.train, base.fit), on.settings.screening)
+    selection = continue_search(on, result.selection, screening)
+    before, after = (assess(on.fine, model, seed) for model in (base, selection.model))
+    return SearchResult(on, base, before, screening, selection, after)
+
+
 def _search_joint_limits(
     problem: IdentificationProblem, on: SelectorPair, base: Model, before: Adequacy
 ) -> SearchResult:
