@@ -199,7 +199,8 @@ def _require_apart(held: Any, seen: set[int]) -> None:
     :raises pickle.PicklingError: likewise
     """
     if isinstance(held, types.FunctionType):
-        if id(held) not in seen:
+        # Those of gymnasium's wrappers, such as ClipAction, look at the spaces alone.
+        if id(held) not in seen and not held.__module__.startswith("gymnasium."):
             seen.add(id(held))
             cells = [cell for cell in held.__closure__ or () if cell != types.CellType()]  # empty: bound later
             defaults = *(held.__defaults__ or ()), *(held.__kwdefaults__ or {}).values()

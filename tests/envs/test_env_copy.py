@@ -182,6 +182,14 @@ def test_functions_over_plain_values_are_shared_with_a_copy() -> None:
     assert episode(copy_env(env)) == episode(env)
 
 
+@pytest.mark.parametrize("wrapper", [gym.wrappers.ClipAction, gym.wrappers.FlattenObservation])
+def test_functions_of_gymnasiums_wrappers_are_shared_with_a_copy(wrapper) -> None:
+    env = wrapper(Helper())
+    expected = episode(wrapper(Helper()))
+    assert episode(copy_env(env)) == expected
+    assert episode(env) == expected
+
+
 def test_an_environment_is_made_of_an_id_a_function_or_itself() -> None:
     env = Helper()
     assert make_env(env) is env
