@@ -307,7 +307,7 @@ def test_a_normalised_agent_is_played_as_it_was_trained(zoo, tmp_path, monkeypat
     small = ["-params", "normalize:dict(norm_obs=True,norm_reward=False)", "policy_kwargs:dict(net_arch=[16])"]
     sac = final(launch(tmp_path, "sac", "-n", "20", "--eval-freq", "-1", *small, env=SOURCE))
     run = launch(tmp_path, "rpo", "--source-model", str(sac), "-n", "4", "--eval-freq", "-1", *SMALL)
-    assert RPO.load(final(run), device="cpu")._resume_state["normalised"]
+    assert RPO.load(final(run), device="cpu").resume_point.normalised
     played, rl_zoo3_enjoy = [], pytest.importorskip("rl_zoo3.enjoy")
     make = rl_zoo3_enjoy.create_test_env
     monkeypatch.setattr(rl_zoo3_enjoy, "create_test_env", lambda *a, **k: played.append(make(*a, **k)) or played[-1])

@@ -208,6 +208,10 @@ class LoopController:
         self.reports: list[Report] = []
         self.found: list[dict[str, Any]] = []
 
+    def __getstate__(self) -> dict[str, Any]:
+        kept = {name: value for name, value in vars(self).items() if name not in ("on_report", "progress")}
+        return {**kept, "reports": []}
+
     def identify_log(self, agent: Agent) -> None:
         """Before anything is learned: phi from a trace of the log, where the target is one."""
 

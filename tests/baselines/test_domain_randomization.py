@@ -7,6 +7,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 from stable_baselines3 import SAC
 
@@ -80,8 +81,8 @@ def test_the_study_counts_what_the_policy_cost_before_its_first_target_step(
     task = study.Task(TASK, NAMES, ("coulomb_friction", 0.1, ("slider",)), 100)
     monkeypatch.setitem(study.TASKS, "pendulum", task)
     monkeypatch.setattr(study, "source_agent", lambda task, folder: (agent, None))
-    job = study.Job("pendulum", "declared", 0, "randomised, SAC-warm", 0)
-    rows = study.collected(study.run(job, tmp_path, 20, 1).parent)
+    job = study.Job("pendulum", "declared", 0, "randomised, SAC-warm", 0, budget=20, episodes=1)
+    rows = pd.DataFrame(study.run(job, tmp_path))
     assert rows["steps"].tolist() == [0, 20]
     assert rows["source_steps"].tolist() == [256, 256]
     assert rows["updates"].iloc[0] == 12

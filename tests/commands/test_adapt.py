@@ -112,7 +112,7 @@ def test_a_run_ends_with_one_row_and_no_checkpoint_of_its_end(total: int, tmp_pa
             seen.append(steps)
 
     shown = Progress(Folder(), total, [], quiet=True)  # type: ignore[arg-type]
-    shown.model = SimpleNamespace(_n_updates=0, loop=SimpleNamespace(accounts=False))  # type: ignore[assignment]
+    shown.model = SimpleNamespace(n_updates=0, loop=SimpleNamespace(simulator_validated=False))  # type: ignore[assignment]
     for steps in range(160, total + 160, 160):
         shown.num_timesteps = min(steps, total)
         shown._on_step()

@@ -81,10 +81,6 @@ class ClosedLoop(LoopController):
         #: of the policy in the simulator as it is fitted
         self.selection = PolicySelection(self.settings)
 
-    def __getstate__(self) -> dict[str, Any]:
-        kept = {name: value for name, value in vars(self).items() if name not in ("on_report", "progress")}
-        return {**kept, "reports": []}
-
     def forget_target(self) -> None:
         """Begin anew with another target: neither what was seen nor how well it was predicted counts there."""
         self.traced_at, self.traced_error, self.retraining = None, math.inf, None
