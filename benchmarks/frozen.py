@@ -66,8 +66,8 @@ def frozen(name: str) -> dict[str, Any]:
         model.learn(STEPS, source_timesteps=SOURCE_STEPS)
     numbers = [p.detach().numpy().ravel() for p in model.policy.state_dict().values()]
     numbers.append(model.log_ent_coef.detach().numpy().ravel())
-    dynamics = model.dynamics.state_dict().values()
-    numbers += [np.asarray(v, np.float64).ravel() for v in dynamics if isinstance(v, th.Tensor | np.ndarray)]
+    dynamics = {} if model.dynamics is None else model.dynamics.state_dict()
+    numbers += [np.asarray(v, np.float64).ravel() for v in dynamics.values() if isinstance(v, th.Tensor | np.ndarray)]
     row = np.concatenate([n.astype(np.float64) for n in numbers])
     digest = hashlib.sha256(row.tobytes()).hexdigest()[:16]
     return {
