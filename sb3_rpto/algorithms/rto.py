@@ -1,48 +1,21 @@
-"""RTO: the weights of transitions, the fit of phi to D_target, and whose rules of the task phi knows."""
+"""RTO: the fit of phi to D_target, and whose rules of the task phi knows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import cloudpickle
 import torch as th
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
-from torch.nn import functional as F
 
 from sb3_rpto.dynamics.base import Dynamics, Transitions
-from sb3_rpto.dynamics.weights import WeightingName, effective_sample_size, rto_weights
+from sb3_rpto.dynamics.weights import effective_sample_size
 from sb3_rpto.envs.task_rules import task_rules
 
 #: What is known of a task: entries of ``dynamics_kwargs`` and attributes of the dynamics.
 RULES = ("reward_fn", "termination_fn")
-
-
-def weights_of_newest(
-    weighting: WeightingName,
-    data: Transitions,
-    dynamics: Dynamics,
-    soft_value: Callable[[th.Tensor], th.Tensor],
-    q_value: Callable[[th.Tensor, th.Tensor], th.Tensor],
-    gamma: float,
-    weight_floor: float,
-) -> th.Tensor:
-    """RTO's weight of each transition (Eq. rto_p2), normalised over those that a fit reads; 0 of older ones.
-
-    :param weighting: which of RTO's weights
-    :param data: D_target, oldest first, rewards on the critic's scale
-    :param dynamics: P_phi
-    :param soft_value: V, of observations (n, d) -> (n,)
-    :param q_value: Q, of observations and actions -> (n,)
-    :param gamma: discount factor
-    :param weight_floor: the smallest weight
-    :return: (n,)
-    """
-    newest = dynamics.fits_newest
-    older = 0 if newest is None else max(0, len(data) - newest)
-    fitted = data.take(slice(older, None))
-    return F.pad(rto_weights(weighting, fitted, dynamics, soft_value, q_value, gamma, weight_floor), (older, 0))
 
 
 def fit(dynamics: Dynamics, data: Transitions, weights: th.Tensor | None, logger: Logger) -> None:

@@ -47,7 +47,7 @@ from sb3_rpto.dynamics.base import Dynamics, Transitions
 from sb3_rpto.dynamics.factory import dynamics_config, is_mujoco, make_dynamics, preset_section
 from sb3_rpto.dynamics.matmul_precision import fast_products
 from sb3_rpto.dynamics.physical import PhysicalDynamics
-from sb3_rpto.dynamics.weights import WeightingName
+from sb3_rpto.dynamics.weights import WeightingName, rto_weights
 from sb3_rpto.envs.env_copy import EnvSource, make_env
 from sb3_rpto.envs.task_rules import env_id
 from sb3_rpto.presets import resolve_preset
@@ -542,7 +542,7 @@ class TransferAlgorithm(TwoEnvSAC):
         assert self.dynamics is not None
         if self.use_sde:  # as in an update: what explored last is no part of a checkpoint
             self.actor.reset_noise()
-        return rto.weights_of_newest(
+        return rto_weights(
             self.weighting,
             self.with_critic_rewards(data),
             self.dynamics,

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Literal, get_args
 
 import torch as th
+from torch.nn import functional as F
 
 from sb3_rpto.dynamics.base import Dynamics, Transitions
 
@@ -23,7 +24,7 @@ def rto_weights(
     gamma: float,
     floor: float,
 ) -> th.Tensor:
-    """The normalised weight of every transition in the set that is being fitted.
+    """The weight of every transition, normalised over those that a fit reads (the newest); 0 of older ones.
 
     - ``"paper"``: (r + gamma (1 - done) V(s'))^2, Eq. rto_p2 with the temperature that the paper leaves out.
     - ``"centred"``: (r + gamma (1 - done) V(s') - Q(s, a))^2: unlike the literal weight it does not change when a
@@ -36,11 +37,13 @@ def rto_weights(
     :param q_value: (observations, actions in env units) -> min_i Q_i(s, a), (n,)
     :param gamma: discount factor
     :param floor: epsilon of the paper, the smallest weight
-    :return: (n,), min-max normalised over ``data``, plus ``floor``
+    :return: (n,), min-max normalised over what is fitted, plus ``floor``
     :raises ValueError: there is no such weighting
     """
     if weighting not in WEIGHTINGS:
         raise ValueError(f"weighting={weighting!r} does not exist; choose one of {list(WEIGHTINGS)}")
+    older = 0 if dynamics.fits_newest is None else max(0, len(data) - dynamics.fits_newest)
+    data = data.take(slice(older, None))
     with th.no_grad():
         if weighting == "value_aware":
             predicted = dynamics.step(data.observations, data.actions, deterministic=True)
@@ -55,7 +58,7 @@ def rto_weights(
             raw = data.rewards + gamma * (1.0 - data.terminations) * soft_value(data.next_observations)
             if weighting == "centred":
                 raw = raw - q_value(data.observations, data.actions)
-        return normalise(raw.square(), floor)
+        return F.pad(normalise(raw.square(), floor), (older, 0))
 
 
 @contextmanager

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
 import textwrap
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -121,35 +121,48 @@ def test_a_run_whose_process_was_ended_is_one_that_failed(tmp_path: Path, monkey
     assert rows_of(run(tmp_path, 2))[0]["square"] == 4, "so it is made again"
 
 
+#: Variable with the path of the pipe on which long runs say that they have begun.
+FIFO = "RPTO_TEST_FIFO"
+
+
 @pytest.mark.slow
 def test_an_interrupted_study_keeps_what_is_finished_and_ends_its_processes(tmp_path: Path) -> None:
     program = f"""
-        import sys, time
+        import sys
         sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parents[2])!r}]
         from benchmarks.runner import run_jobs
         from test_runner import Square, slow_after_two
         run_jobs(slow_after_two, [Square(n) for n in range(4)], {str(tmp_path)!r}, 2)
     """
-    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(program)], start_new_session=True)
-    deadline = time.monotonic() + 300
-    while len(list(tmp_path.glob("square*.json"))) < 2 and time.monotonic() < deadline:
-        time.sleep(0.2)
+    fifo = tmp_path / "begun"
+    os.mkfifo(fifo)
+    reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+    environment = {**os.environ, FIFO: str(fifo)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(program)], start_new_session=True, env=environment
+    )
+    begun = b""
+    while len(begun) < 2:  # both workers are at a long run, so the two short ones are finished
+        begun += read_in_time(reader)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     assert process.wait(timeout=120) != 0
     assert sorted(file.name for file in tmp_path.glob("*.json")) == ["square-0.json", "square-1.json"]
-    while time.monotonic() < deadline:
-        try:
-            os.killpg(process.pid, 0)
-        except ProcessLookupError:
-            break
-        time.sleep(0.2)
-    else:
-        pytest.fail("its workers live on")
+    assert read_in_time(reader) == b"", "its workers live on"
+    os.close(reader)
+
+
+def read_in_time(reader: int) -> bytes:
+    """What was written to a pipe; nothing once all of its writers have ended."""
+    ready, _, _ = select.select([reader], [], [], 300)
+    assert ready, "nothing was written, and the writers live on"
+    return os.read(reader, 10)
 
 
 def slow_after_two(job: Square) -> list[dict[str, Any]]:
     if job.number >= 2:
-        time.sleep(600)
+        with open(os.environ[FIFO], "wb", buffering=0) as begun:
+            begun.write(b".")
+            signal.pause()
     return squared(job)
 
 

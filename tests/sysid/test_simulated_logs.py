@@ -8,6 +8,9 @@ import pytest
 
 from sb3_rpto.sysid import Measurements, trace
 from sb3_rpto.sysid.findings import FindingKind
+from sb3_rpto.sysid.hypotheses.simulated_data import OtherSubsteps
+from sb3_rpto.sysid.problem.problem import Assumptions, Inputs, prepare
+from sb3_rpto.sysid.selection.search import search
 
 ARM = """<mujoco><compiler angle="radian" autolimits="true"/><option timestep="0.002" integrator="implicitfast">
 <flag contact="disable"/></option><worldbody><body name="upper">
@@ -66,6 +69,27 @@ def test_commands_that_are_late_at_all_joints_and_late_sensors_are_one_class() -
     for traced, joint in zip(report.effects, ("shoulder", "elbow")):
         assert traced.effect.values == pytest.approx([0.015], abs=1e-3)
         assert {traced.label, *traced.alike} >= {f"command_delay({joint}_servo)", f"sensor_delay({joint})"}
+
+
+@pytest.mark.slow
+def test_the_simulators_steps_are_chosen_anew_with_what_was_found() -> None:
+    kinds = ("soft_friction",)
+    asked = Inputs(
+        ARM.format(friction=0, **ONE), log(ONE, friction=0.3), ["shoulder.damping"], candidates=kinds, threads=1
+    )
+    problem = prepare(asked, Assumptions(simulated=True))  # in steps of 2 ms
+    result = search(problem)
+    assert [effect.kind for effect in result.named] == ["soft_friction"]
+    hypothesis = OtherSubsteps()
+    assert hypothesis.applies(problem, result)
+    other = hypothesis.alternative(problem, result)
+    assert other is not None
+    assert other.data.substeps == 2  # of a millisecond, as the log's
+    other, then = hypothesis.search(other, result)
+    assert hypothesis.accepts(result, then)
+    assert then.after.ratio < result.after.ratio
+    assert then.named[0].kind == "soft_friction"
+    assert hypothesis.alternative(other, then) is None
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from sb3_rpto.sysid.findings import Finding, FindingKind
 from sb3_rpto.sysid.hypotheses.hypothesis import Hypothesis, kept_effects
 from sb3_rpto.sysid.problem.data_origin import are_exact_states, find_origin, may_be_exact
 from sb3_rpto.sysid.problem.problem import IdentificationProblem
-from sb3_rpto.sysid.selection.search import SearchResult, SelectorPair, search_on
+from sb3_rpto.sysid.selection.search import SearchResult, SelectorPair, resume_search
 
 #: What was assumed of friction and of kinds is asked anew where the recordings are of another origin.
 ANEW = {"kinds": None, "soft_friction": False}
@@ -70,7 +70,7 @@ class OtherSubsteps(Hypothesis):
         self, alternative: IdentificationProblem, result: SearchResult
     ) -> tuple[IdentificationProblem, SearchResult]:
         """The search goes on from what was found."""
-        return alternative, search_on(alternative, result)
+        return alternative, resume_search(alternative, result)
 
     def accepts(self, result: SearchResult, alternative: SearchResult) -> bool:
         """Where they explain as well."""

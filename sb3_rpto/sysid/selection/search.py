@@ -165,7 +165,7 @@ def search(problem: IdentificationProblem) -> SearchResult:
     return SearchResult(on, base, before, screening, selection, after, substeps)
 
 
-def search_on(problem: IdentificationProblem, result: SearchResult) -> SearchResult:
+def resume_search(problem: IdentificationProblem, result: SearchResult) -> SearchResult:
     """Go on from a result on another reading of the same windows, with the same candidates.
 
     :param problem: the recordings as they are read now
