@@ -2,6 +2,7 @@
 
     python -m benchmarks frozen            # run all and compare with the table
     python -m benchmarks frozen --record   # write the table anew
+    python -m benchmarks frozen --traces runs/tracing.csv   # verdicts, effects and values of the quick sets
 
 Bits depend on the processor and on torch: record the table from the commit before a change, on the same computer.
 """
@@ -12,6 +13,7 @@ import hashlib
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -20,13 +22,17 @@ import pandas as pd
 import torch as th
 
 from benchmarks import RESULTS
-from benchmarks.runner import Row, chosen, parser_of, run_jobs
+from benchmarks.runner import Row, chosen, parser_of, read_table, run_jobs
 from sb3_rpto import RPO, RPTO, RTO
 from sb3_rpto.algorithms.transfer import TransferAlgorithm
 from sb3_rpto.effects import LIBRARY
 from sb3_rpto.envs.corrected import apply_effects
 
 TABLE = RESULTS / "frozen_parameters.csv"
+#: Verdicts, effects and values of the quick sets of the tracing study, from the commit before the change.
+TRACES = RESULTS / "frozen_traces.csv"
+#: Values that differ by less, relative to the larger, are the same: the table has six digits.
+SAME = 2e-5
 #: Target steps with one fit of the dynamics among them and updates after it, and source steps before.
 STEPS, SOURCE_STEPS = 300, 500
 ENSEMBLE = {"dynamics": "ensemble", "dynamics_kwargs": {"max_steps": 200}}
@@ -86,6 +92,40 @@ def frozen(job: Job) -> list[Row]:
     return [{"run": job.name, **counts, "norm": f"{np.linalg.norm(row):.10g}", "sha256": digest}]
 
 
+def compare_traces(table: Path, frozen_table: Path = TRACES) -> pd.DataFrame:
+    """A table of the tracing study beside the frozen one: a row for each set that both have.
+
+    :param table: as ``python -m benchmarks tracing --out NAME`` writes it
+    :param frozen_table: what it is compared with
+    :return: verdicts and effects then and now, the largest relative difference of a value, and whether all are the same
+    :raises ValueError: they have no set in common
+    """
+    then = {row["set"]: row for row in read_table(frozen_table)}
+    rows = []
+    for row in read_table(table):
+        known = then.get(row["id"])
+        if known is None:
+            continue
+        values = _values(row)
+        labels = " ".join(effect["label"] for effect in row["effects"])
+        old = known["values"]
+        pairs = [(old[name], values[name]) for name in old if name in values]
+        off = max((abs(a - b) / max(abs(a), abs(b), 1e-12) for a, b in pairs), default=0.0)
+        alike = (row["verdict"], labels, {*values}) == (known["verdict"], known.get("effects") or "", {*old})
+        found = {"set": row["id"], "verdict": row["verdict"], "effects": labels, "off": off}
+        rows.append({**found, "same": alike and off < SAME})
+    if not rows:
+        raise ValueError(f"{table} has none of the sets of {frozen_table}; run 'python -m benchmarks tracing' first")
+    return pd.DataFrame(rows)
+
+
+def _values(row: Row) -> dict[str, float]:
+    """Fitted values by the parameter's name, of effects with their label before it."""
+    declared = {name: p["value"] for one in row["declared"] for name, p in one["parameters"].items()}
+    named = {f"{e['label']}.{name}": p["value"] for e in row["effects"] for name, p in e["parameters"].items()}
+    return declared | named
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Record or compare.
 
@@ -94,7 +134,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = parser_of("frozen", __doc__, "frozen")
     parser.add_argument("--record", action="store_true", help="write the table anew")
+    parser.add_argument("--traces", type=Path, metavar="CSV", help="compare this table of the tracing study instead")
     asked = parser.parse_args(arguments)
+    if asked.traces is not None:
+        compared = compare_traces(asked.traces)
+        print(compared.to_string(index=False))
+        return 0 if compared["same"].all() else 1
     listed = chosen([Job(name) for name in RUNS], asked.only)
     if asked.list:
         print(*(job.name for job in listed), sep="\n")
